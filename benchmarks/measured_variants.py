@@ -53,7 +53,9 @@ def variants(_: Path) -> list[str]:
         began = time.process_time()
         files = [ImageFile(Path(n), a) for n, a in zip(("psf.tif", "raw.tif"), make(psf, raw), strict=True)]
         try:
-            job = job_from_files(files[0], files[1], InputOptions(binning=BINNING))
+            job = job_from_files(
+                files[0], files[1], InputOptions(**{"binning": BINNING} | dict(INPUTS.get(name, {})))
+            )
         except FileError as error:
             lines.append(f"| {name} | refused: {error} | | | | |")
             continue
@@ -92,6 +94,20 @@ def vignetted(raw: Array) -> Array:
     """Return light that falls off to a half in the corners, which the PSF does not know."""
     y, x = (np.linspace(-1, 1, n) for n in raw.shape)
     return light(raw) * (1 - 0.25 * (y[:, None] ** 2 + x**2))
+
+
+def cos4(shape: tuple[int, ...], corner: float) -> Array:
+    """Return light that falls off round about the middle, as of a lens, to so much in the corners."""
+    y, x = (np.arange(n) - (n - 1) / 2 for n in shape)
+    off_axis2 = (y[:, None] ** 2 + x**2) / (y[0] ** 2 + x[0] ** 2)
+    return np.asarray(1 / (1 + (corner**-0.5 - 1) * off_axis2) ** 2)
+
+
+def off_middle(shape: tuple[int, ...]) -> Array:
+    """Return light of a hill that stands beside the middle."""
+    y, x = (np.linspace(-1, 1, n) for n in shape)
+    hill = np.exp(-((y[:, None] + 0.2) ** 2 + (x - 0.3) ** 2) / 1.3)
+    return np.asarray(hill / hill.max())
 
 
 def fewer(raw: Array, share: float, counts_per_electron: float = 8.0) -> Array:
@@ -134,6 +150,17 @@ def clusters(raw: Array, count: int, side: int = 3) -> Array:
     return copy
 
 
+def halved(raw: Array) -> Array:
+    """Return what a camera gives that averages 2 x 2 pixels."""
+    return counts(block_mean(raw.astype(np.float32), 2))
+
+
+def middle(raw: Array) -> Array:
+    """Return the middle half of the rows and columns, as a region of interest."""
+    rows, columns = (slice(n // 4, n // 4 + n // 2) for n in raw.shape)
+    return np.ascontiguousarray(raw[rows, columns])
+
+
 def electrons(raw: Array, most: float) -> Array:
     """Return a photograph of few photo-electrons, a count each."""
     share = np.maximum(light(raw), 0) / light(raw).max()
@@ -162,6 +189,15 @@ VARIANTS: Mapping[str, Callable[[Array, Array], tuple[Array, ...]]] = {
     "photograph: 1 % of the pixels at random values": lambda p, y: (p, planted(y, 0.01)),
     "both: the same 0.1 % at full scale": lambda p, y: (planted(p, 0.001, FULL), planted(y, 0.001, FULL)),
     "photograph vignetted": lambda p, y: (p, counts(vignetted(y) + 30)),
+    "photograph falling off by cos^4 to 69 %": lambda p, y: (p, counts(light(y) * cos4(y.shape, 0.69) + 30)),
+    "photograph falling off by cos^4 to 25 %": lambda p, y: (p, counts(light(y) * cos4(y.shape, 0.25) + 30)),
+    "photograph under a hill beside the middle": lambda p, y: (
+        p,
+        counts(light(y) * off_middle(y.shape) + 30),
+    ),
+    "both falling off by cos^4 to 39 %": lambda p, y: tuple(
+        counts(light(a) * cos4(a.shape, 0.39) + 30) for a in (p, y)
+    ),
     "photograph: 2000 counts too many taken off": lambda p, y: (p, counts(light(y) - 2000)),
     "photograph: rows share a noise of 400": lambda p, y: (p, striped(y, 400)),
     "both: three dead columns": lambda p, y: tuple(columns(a, 0, (200, 777, 1300)) for a in (p, y)),
@@ -171,6 +207,17 @@ VARIANTS: Mapping[str, Callable[[Array, Array], tuple[Array, ...]]] = {
     "both as JPEG, quality 50": lambda p, y: (compressed(p, 50), compressed(y, 50)),
     "photograph for the eye (sRGB), PSF raw": lambda p, y: ((p >> 8).astype(np.uint8), coded(y)),
     "both for the eye (sRGB)": lambda p, y: (coded(p), coded(y)),
+    "PSF for the eye (sRGB), photograph raw": lambda p, y: (coded(p), (y >> 8).astype(np.uint8)),
+    "photograph for the eye, `--srgb photograph`": lambda p, y: ((p >> 8).astype(np.uint8), coded(y)),
+    "both for the eye, `--srgb both`": lambda p, y: (coded(p), coded(y)),
+    "PSF for the eye, `--srgb psf`": lambda p, y: (coded(p), (y >> 8).astype(np.uint8)),
+    "photograph binned 2 x 2": lambda p, y: (p, halved(y)),
+    "PSF binned 2 x 2": lambda p, y: (halved(p), y),
+    "the middle half of the photograph, taken for a binned one": lambda p, y: (p, middle(y)),
+    "PSF with colours": lambda p, y: (
+        np.stack([counts(g * light(p) + 30) for g in (1, 0.6, 0.3)], axis=-1),
+        y,
+    ),
     "PSF over a hill of light": lambda p, y: (on_a_hill(p), y),
     "PSF twice, moved by 40 and 25 pixels": lambda p, y: (
         counts((light(p) + np.roll(light(p), (40, 25), axis=(0, 1))) / 2 + 30),
@@ -180,6 +227,15 @@ VARIANTS: Mapping[str, Callable[[Array, Array], tuple[Array, ...]]] = {
     "photograph exposed 8 times as long": lambda p, y: (p, counts(8 * light(y) + 30)),
 }
 """By name: from PSF and photograph, raw counts, what is given."""
+INPUTS: Mapping[str, Mapping[str, Any]] = {
+    "photograph for the eye, `--srgb photograph`": {"srgb": "photograph"},
+    "both for the eye, `--srgb both`": {"srgb": "both"},
+    "PSF for the eye, `--srgb psf`": {"srgb": "psf"},
+    "photograph binned 2 x 2": {"binning": BINNING // 2},
+    "PSF binned 2 x 2": {"binning": BINNING // 2},
+    "the middle half of the photograph, taken for a binned one": {"binning": BINNING // 2},
+}
+"""By name: what is said besides."""
 
 
 def alike(image: Array, reference: Array) -> tuple[float, float]:

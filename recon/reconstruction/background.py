@@ -278,6 +278,10 @@ TELLING = 1.1
 darkest corner, from which a shade is what lacked. Photographs that were shaded: 1.5 to 2.7 (six measured
 pairs), 4.9 and 5.7 (the hand). Three pairs with a tenth too much taken off 0.66 to 0.69; the hand and another
 pair are explained by no shade. A deep one explains nearly anything."""
+PEDESTAL = 0.1
+"""Darkest hundredth of a PSF, relative to its mean, from which it may stand on an even offset: that casts
+light which falls off, where the photograph's does not. The hand's, the USAF target's and the pairs' have
+0.00, with an offset of a fiftieth of their peak 0.15 to 0.36."""
 LEAST_OFFSET = 0.03
 """Offset, relative to the photograph's mean, from which one is added: two channels of the seven measured
 pairs come to 0.02."""
@@ -374,8 +378,9 @@ class _Small:
 def _shade_of(small: _Small, given: Floats) -> Floats | None:
     """Return the numbers of the least shade by which the channels are explained as a rule; None: none is.
 
-    One for all, fitted to the channel that has most contrast. More shade is explained as well as a rule, by
-    an object that is brighter towards its edges; and where something else lacks, only by a deep one.
+    None where the PSF stands on an offset, too: what that lacks looks like a shade. One for all, fitted to
+    the channel that has most contrast. More shade is explained as well as a rule, by an object that is
+    brighter towards its edges; and where something else lacks, only by a deep one.
 
     Parameters
     ----------
@@ -385,6 +390,8 @@ def _shade_of(small: _Small, given: Floats) -> Floats | None:
     """
     most = int(np.argmax(small.usual2))
     shape = small.channels[most].sensor_shape
+    if floor(small.channels[most].calibration.psfs, DARKEST_PERCENTILE) > PEDESTAL:
+        return None
     numbers = _shade_fitted(small.channels[most], 1 + float(small.usual2[most]))
 
     def left2(share: float) -> Floats:

@@ -60,6 +60,13 @@ def test_the_shade_of_a_scene_is_found_and_where_there_is_none_none_is() -> None
     assert with_light_restored(clear) is clear
 
 
+def test_a_psf_that_stands_on_an_offset_shades_no_photograph() -> None:
+    scene = make_scene("dense-picture", size=40, photons=3000.0, seed=4)
+    psf = scene.calibration.psfs[0, 0]
+    restored = with_light_restored(Problem.of(Measurement(scene.measurement), psf + 0.05 * psf.max()))
+    assert restored.measurement.vignetting is None
+
+
 @measured
 def test_a_shaded_photograph_is_as_good_as_one_that_is_not(hand: tuple[Image, Image]) -> None:
     photograph, psf = hand
