@@ -29,6 +29,8 @@ Floats = npt.NDArray[np.float64]
 Image = npt.NDArray[np.float32]
 
 SIDES = ("left", "right", "top", "bottom")
+_ALIKE = 3.0
+"""Times as bright as its opposite a half may be: light that flickers by 40 % makes it 2.3."""
 _LINES = 48  # across the pupil, for the transfer function
 
 
@@ -66,9 +68,10 @@ def phase_from_halves(
     """Return the phase of a thin sample in radians, float32 (height, width), mean and mean slope zero.
 
     Halves of unequal brightness look like a sample tilted up to its edges: each is brought to its opposite's
-    mean, and the tilt that is left is taken off.
+    mean, within 3 : 1, and the tilt that is left is taken off.
 
-    Raises InputError when a half is missing, shapes differ, or there is no light.
+    Raises InputError when a half is missing, shapes differ, there is no light, or a half has less than a
+    third of its opposite's.
 
     Parameters
     ----------
@@ -88,8 +91,8 @@ def phase_from_halves(
     shapes = {image.shape for image in images.values()}
     if len(shapes) != 1 or images["left"].ndim != 2:
         raise InputError(f"The halves must be grey images of one shape, not {sorted(shapes)}.")
-    across = _contrast(images["right"], images["left"])
-    down = _contrast(images["top"], images["bottom"])
+    across = _contrast(images, "right", "left")
+    down = _contrast(images, "top", "bottom")
     height, width = across.shape
     # A phase mirrored at the edges is continuous; its slope then changes sign across the mirror.
     x, y = _mirrored(across, odd_axis=1), _mirrored(down, odd_axis=0)
@@ -156,13 +159,21 @@ def deflections_deg(slope_deg: Floats, index: float) -> Floats:
     return np.asarray(np.rad2deg(np.arcsin(np.minimum(index * np.sin(slope), 1.0)) - slope))
 
 
-def _contrast(first: Floats, second: Floats) -> Floats:
+def _contrast(images: Mapping[str, Floats], one: str, opposite: str) -> Floats:
+    first, second = images[one], images[opposite]
     total = first + second
     if not (total.mean() > 0 and (total > 0).mean() > 0.99):
         raise InputError("The halves show no light above dark: are the LEDs on, and is the exposure right?")
-    if min(first.mean(), second.mean()) > 0:  # in between the light may have changed
-        second = second * float(first.mean() / second.mean())
-        total = first + second
+    light = {side: float(images[side].mean()) for side in (one, opposite)}
+    dim, bright = sorted(light, key=light.__getitem__)
+    if light[bright] > _ALIKE * light[dim]:
+        raise InputError(
+            f"The half {dim!r} is dim: {light[dim]:.3g} counts of light, and {light[bright]:.3g} in its "
+            f"opposite {bright!r}; at most {_ALIKE:g} times as many can be evened out. Are its LEDs on? "
+            "Light it as its opposite is lit, and take the halves again."
+        )
+    second = second * (light[one] / light[opposite])  # in between the light may have changed
+    total = first + second
     contrast = (first - second) / np.maximum(total, 1e-3 * float(total.mean()))
     return np.asarray(contrast)
 

@@ -193,6 +193,12 @@ def test_what_cannot_give_a_phase_is_refused() -> None:
         phase_from_halves(ones | {"left": np.ones((8, 9))}, OPTICS)
     with pytest.raises(InputError, match="no light"):
         phase_from_halves(dict.fromkeys(SIDES, np.zeros((8, 8))), OPTICS)
+    dark = np.random.default_rng(0).normal(2, 5, (8, 8))
+    with pytest.raises(InputError, match="half 'top' is dim"):
+        phase_from_halves({side: 1000 * ones[side] for side in SIDES} | {"top": dark}, OPTICS)
+    with pytest.raises(InputError, match="half 'left' is dim"):
+        phase_from_halves(ones | {"left": -1e-3 * ones["left"]}, OPTICS)
+    phase_from_halves(ones | {"left": 0.43 * ones["left"]}, OPTICS)  # light that flickers by 40 %
     with pytest.raises(InputError, match="do not fill"):
         DpcOptics(1.6, 515.0, 0.1, 0.08)
     with pytest.raises(BenchError, match="red, green, blue"):
