@@ -9,8 +9,10 @@ upside down, and pixel offset ``p`` from the centre looks at ``x = -p pitch z / 
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from decimal import Decimal
 from numbers import Real
 from typing import Any
 
@@ -62,8 +64,16 @@ def real_array(given: Any, name: str, dtype: type[np.floating] = np.float32) -> 
 
 
 def plain_number(given: Any) -> Any:
-    """Return the number that an array without axes holds, as np.load gives it; anything else as it is."""
-    return given.item() if getattr(given, "shape", None) == () and hasattr(given, "item") else given
+    """Return the one number of an array, as files of NumPy, MATLAB and HDF5 hold scalars, or of a Decimal.
+
+    Anything else as it is, and what NumPy's masks hide as ``np.ma.masked``, which is no number.
+    """
+    if isinstance(given, Decimal):
+        return float(given)
+    shape = getattr(given, "shape", None)
+    if not isinstance(shape, tuple) or math.prod(shape) != 1 or not hasattr(given, "item"):
+        return given
+    return np.ma.masked if np.ma.is_masked(given) else given.item()
 
 
 @dataclass(frozen=True, slots=True)

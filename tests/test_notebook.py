@@ -8,6 +8,7 @@ import os
 import subprocess
 import sys
 import threading
+from decimal import Decimal
 from pathlib import Path
 from typing import Any
 
@@ -421,6 +422,10 @@ WRONG = {
     "db.metrics.psnr(SQUARE.astype(object), SQUARE)": r"object; array.astype\(float\) makes numbers",
     "db.reconstruct(SQUARE, SQUARE.astype(object))": r"object; array.astype\(float\) makes numbers",
     "db.L1(-1)": "A prior's weight must be a number, 0 or more, not -1",
+    "db.L1(np.ma.masked)": "A prior's weight must be a number, 0 or more, not masked",
+    "db.L1(np.ma.array([0.1], mask=True))": "A prior's weight must be a number, 0 or more, not masked",
+    "db.L1([0.1])": "A prior's weight must be a number, 0 or more, not ",
+    "db.L1(float('-inf'))": "A prior's weight must be a .*number, 0 or more, not -inf",
     "db.L1(True)": "A prior's weight must be a number, 0 or more, not True",
     "db.Geometry('6.5')": "pixel_pitch_um must be a number, or None where unknown, not str",
     "db.NoiseModel(SQUARE, 1)": "read_noise must be a number, in counts",
@@ -444,7 +449,13 @@ def _names() -> dict[str, Any]:
     square = np.ones((9, 9))
     camera = db.Convolution(square[None].astype(np.float32), (9, 9))
     calibration = db.Calibration(square[None, None], [[0, 0, 1e4]])
-    modules = {"db": db, "np": np, "threading": threading, "multiprocessing": multiprocessing}
+    modules = {
+        "db": db,
+        "np": np,
+        "threading": threading,
+        "multiprocessing": multiprocessing,
+        "Decimal": Decimal,
+    }
     modules |= {"require_hooks": require_hooks, "depths_of": _depths}
     return modules | {"SQUARE": square, "CAMERA": camera, "CALIBRATION": calibration}
 
@@ -469,6 +480,11 @@ TAKEN = (
     "db.Geometry(aperture_mm=[5.5, np.array(7)])",
     "db.Geometry(aperture_mm=np.array([5.5, 7]))",
     "db.Box(np.array(0.0), float('inf'))",
+    "db.L1(np.array([[0.1]]))",
+    "db.L1(Decimal('0.1'))",
+    "db.L1(float('inf'))",
+    "db.Box(np.array([0.0]), np.array([[1.0]]))",
+    "db.Geometry(np.array([[6.5]]), Decimal('2.1'), np.array([[3.0], [4.0]]))",
     "depths_of(np.array(0.0), 2)",
     "db.PointSweep(points_um=[[0, 0, 1e4], [1, 0, 1e4]])",
     "db.PointSweep(points_um=np.array([[0, 0, 1e4], [1, 0, 1e4]]))",

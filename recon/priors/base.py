@@ -126,13 +126,15 @@ class Sum(Prior):
 
 def require_weight(weight: float) -> float:
     """Return a prior's weight; raises InputError for a negative one, and for what is no number."""
-    return float(require_argument("A prior's weight", weight, float, least=0))
+    return _number("A prior's weight", weight, least=0)
 
 
-def _limit(name: str, given: Any) -> float:
-    """Return a number, or an infinity; raises InputError for anything else."""
-    endless = isinstance(number := plain_number(given), float) and math.isinf(number)
-    return float(number if endless else require_argument(name, given, float))
+def _number(name: str, given: Any, least: float = -math.inf) -> float:
+    """Return a number from ``least`` on, or an infinity; raises InputError for anything else."""
+    number = plain_number(given)
+    endless = isinstance(number, float) and math.isinf(number) and number >= least
+    limits = {} if least == -math.inf else {"least": least}
+    return float(number if endless else require_argument(name, number, float, "", **limits))
 
 
 class Separable(Prior):
@@ -144,7 +146,7 @@ class Separable(Prior):
 
     def __init__(self, weight: float = 0.0, lower: float = -np.inf, upper: float = np.inf) -> None:
         self.weight = require_weight(weight)
-        self.lower, self.upper = _limit("The lower limit", lower), _limit("The upper limit", upper)
+        self.lower, self.upper = _number("The lower limit", lower), _number("The upper limit", upper)
         if not self.lower <= self.upper:
             raise InputError(f"The box's lower limit {lower:g} is above its upper limit {upper:g}.")
 
