@@ -130,6 +130,7 @@ def find_screen(bench: Bench, control: RunControl, listener: Listener) -> Screen
             listener.share(done := done + 1, total)
         seen.append(field_along(np.array(light), shape[axis]))
     screen.require_darkness(max(light))
+    listener.share(done := done + 1, total)
     (top, bottom), (left, right) = seen
     side = max(2, round(_MARK * (bottom - top)))
     spread = np.linspace(-_MARKS_WITHIN / 2, _MARKS_WITHIN / 2, _MARKS)
@@ -147,11 +148,13 @@ def find_screen(bench: Bench, control: RunControl, listener: Listener) -> Screen
     screen.expose(mark(corners[middle]), 0.7)
     factor = max(1, bench.camera.frame_shape[0] // _FOUND_PX)
     first = screen.light(mark(corners[middle]))
+    listener.share(done := done + 1, total)
     photographs = []
     for corner in corners:
         photographs.append(block_mean(screen.light(mark(corner)), factor))
         listener.share(done := done + 1, total)
     _require_rest(first, screen.light(mark(corners[middle])))
+    listener.share(done + 1, total)
     places, shifts = [], []
     for corner, photograph in zip(corners, photographs, strict=True):
         found = register(photograph, photographs[middle])

@@ -18,6 +18,7 @@ from calibration_routines.optics.screen_pictures import (
     field_along,
     random_cells,
 )
+from calibration_routines.optics.screen_search import SEARCH
 from calibration_routines.optics.screen_solve import (
     PICTURE,
     TONE,
@@ -60,10 +61,18 @@ def true_psf(bench: Bench) -> np.ndarray:
 
 
 def test_the_psf_is_that_of_a_point_and_gamma_is_the_screens(tmp_path: Path) -> None:
+    shares: list[float] = []
+
+    class Shares(Listener):
+        def share(self, done: float, total: float, *, at_most: bool = False) -> None:
+            if total == SEARCH:
+                shares.append(done)
+
     with small_bench() as bench:
-        done = ScreenProcedure(ASKED).carry_out(bench, tmp_path)
+        done = ScreenProcedure(ASKED).carry_out(bench, tmp_path, listener=Shares())
         truth = true_psf(bench)
         assert not bench.slm or not bench.slm.displayed.any()
+    assert shares == list(range(1, SEARCH + 1))
     found = done.result
     assert isinstance(found, ScreenCalibration)
     assert done.good, found.findings
