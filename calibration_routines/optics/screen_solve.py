@@ -182,12 +182,7 @@ class _Frames:
         found = [sentence.rstrip(".") for sentence in words]
         white = list(self.of[TONE].values())[-1]
         (again,) = self.of[AGAIN].values()
-        change = compare(self.mean(again).mean(axis=0), self.mean(white).mean(axis=0))
-        if by * change.shift_px > max(MOVED_PX, _SURE * by * change.place_noise):
-            found.append(
-                f"the picture moved by {by * change.shift_px:.1f} pixels during the run: clamp screen, "
-                "diffuser and camera, let them warm up"
-            )
+        found += moved_meanwhile(self.mean(again).mean(axis=0), self.mean(white).mean(axis=0), binning=by)
         return found
 
     def level(self, label: str) -> list[float]:
@@ -218,6 +213,26 @@ class _Frames:
             for frames in shown.values()
             for n in frames
         )
+
+
+def moved_meanwhile(again: Floats, white: Floats, *, binning: int) -> tuple[str, ...]:
+    """Return in words how far white lies elsewhere in the end; nothing where noise hides its structure.
+
+    Parameters
+    ----------
+    again, white : ndarray, float32, (height, width)
+        Last and first.
+    binning : int
+        Pixels of the camera to one of theirs.
+    """
+    change = compare(again, white)
+    moved_px = binning * change.shift_px
+    if not np.isfinite(moved_px) or moved_px <= max(MOVED_PX, _SURE * binning * change.place_noise):
+        return ()
+    return (
+        f"the picture moved by {moved_px:.1f} pixels during the run: clamp screen, diffuser and camera, let "
+        "them warm up",
+    )
 
 
 def solving_work(asked: ScreenOptions, image: tuple[int, ...]) -> tuple[float, float]:

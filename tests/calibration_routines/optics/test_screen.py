@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy import ndimage
 
 from calibration_routines.optics.screen_bench import ScreenProcedure, draw_pictures
 from calibration_routines.optics.screen_pictures import (
@@ -25,9 +26,11 @@ from calibration_routines.optics.screen_solve import (
     ScreenCalibration,
     ScreenOptions,
     findings_of,
+    moved_meanwhile,
 )
 from calibration_routines.procedure import Listener
 from calibration_routines.purpose import CalibrationError
+from calibration_routines.scatter import compare
 from calibration_routines.times import first_guess
 from drivers.simulated.world import SimulatedWorld
 from instrument.bench.bench import Bench, open_bench
@@ -176,6 +179,19 @@ def test_pixels_that_turn_hot_do_not_mislead_the_search_and_shaking_is_said(tmp_
     assert not done.good
     assert any("the picture shakes by" in line for line in done.verdict)
     assert done.result.calibration.quality["registration_px"] < 2
+
+
+def test_a_white_in_whose_noise_no_place_is_found_is_not_said_to_have_moved() -> None:
+    """An even white through a diffuser has little structure: "moved by inf pixels" made it doubtful."""
+    rng = np.random.default_rng(0)
+    even = [rng.normal(1000, 5, (96, 128)).astype(np.float32) for _ in range(2)]
+    assert not np.isfinite(compare(*even).shift_px)
+    assert moved_meanwhile(*even, binning=1) == ()
+    structured = 1000 + 1000 * ndimage.gaussian_filter(rng.normal(size=(96, 128)), 1.5).astype(np.float32)
+    assert moved_meanwhile(np.roll(structured, 2, axis=1), structured, binning=2)[0].startswith(
+        "the picture moved by "
+    )
+    assert moved_meanwhile(structured, structured, binning=1) == ()
 
 
 def test_a_map_is_found_from_marks_but_for_one_that_is_wrong() -> None:
