@@ -223,7 +223,7 @@ def job_with(
         raise FileError(folder, "a calibration's PSFs are in proportion to the light.", "--srgb photograph.")
     image = straightened(image) if inputs.srgb == "photograph" else image
     shape = calibration.psfs.shape[-2:]
-    match = _matching_binning(image, shape, folder)
+    match = matching_binning(image, shape, folder)
     pattern = pattern_of(inputs.mosaic, image)
     calibration, grey = matched_calibration(calibration, image, mosaic=pattern is not None)
     level = calibrated_dark(inputs.dark, image, calibration, match)
@@ -302,7 +302,11 @@ def find_calibration(folder: Path) -> Path:
     return inside[0]
 
 
-def _matching_binning(image: ImageFile, shape: tuple[int, ...], folder: Path) -> int:
+def matching_binning(image: ImageFile, shape: tuple[int, ...], folder: Path) -> int:
+    """Return how many of an image's pixels, along each side, one of the PSFs of ``shape`` has.
+
+    Raises FileError when it is no whole number.
+    """
     height, width = image.pixels.shape[:2]
     factor = height // shape[0]
     if factor < 1 or (height // factor, width // factor) != tuple(shape):

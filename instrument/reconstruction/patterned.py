@@ -17,7 +17,7 @@ from instrument.files.calibration_file import load_calibration
 from instrument.files.errors import BenchError, FileError, count
 from instrument.files.images import ImageFile
 from instrument.plan.illumination import DARK, PATTERN
-from instrument.reconstruction.job import Job, find_calibration, job_with
+from instrument.reconstruction.job import Job, find_calibration, job_with, matching_binning
 from instrument.reconstruction.mosaic import pattern_of
 from instrument.reconstruction.options import InputOptions
 from instrument.reconstruction.request import refocused
@@ -91,7 +91,7 @@ def prepare_patterned(
     run = Run.open(request.run)
     from_file = request.sheet.suffix.lower() == ".npy"
     # A file's patterns have the frames' own pixels.
-    inputs = request.inputs if from_file else _whole_colours(request.inputs, run)
+    inputs = request.inputs if from_file else _whole_colours(request.inputs, run, calibration, folder)
     lit = _Lit.of(run, calibration, folder, inputs)
     job = replace(
         lit.job,
@@ -139,10 +139,11 @@ def prepare_patterned(
     return PreparedPatterned(replace(job, warnings=tuple(warnings)), measurement, request)
 
 
-def _whole_colours(inputs: InputOptions, run: Run) -> InputOptions:
+def _whole_colours(inputs: InputOptions, run: Run, calibration: Calibration, folder: Path) -> InputOptions:
     """Return how a mosaic's raw frames are read where nothing is said of pixels: every colour in each.
 
-    Red and blue have a quarter of the sensor's own pixels, by which the iterations come on slowly.
+    Red and blue have a quarter of the sensor's own pixels, by which the iterations come on slowly. Where a
+    pixel of the calibration is several of the frames', it has every colour by itself.
     """
     steps = [] if run.plan is None else run.steps(PATTERN)
     if inputs.binning is not None or not steps or steps[0].index not in run.records:
@@ -150,7 +151,9 @@ def _whole_colours(inputs: InputOptions, run: Run) -> InputOptions:
     told = {"pixel_format": run.metadata(steps[0].index).pixel_format}
     frame = ImageFile(run.path, run.frame(steps[0]), metadata=told)
     mosaic = None if frame.is_colour else pattern_of(inputs.mosaic, frame)
-    return inputs if mosaic is None else replace(inputs, binning=2)
+    if mosaic is None or matching_binning(frame, calibration.psfs.shape[-2:], folder) > 1:
+        return inputs
+    return replace(inputs, binning=2)
 
 
 def solve_patterned(

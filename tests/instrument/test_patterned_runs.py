@@ -138,6 +138,11 @@ def test_a_colour_camera_in_patterned_light(files: tuple[Path, Path, Path], tmp_
     assert "--bin 1" in prepared.job.notes["Pixels"]
     own = replace(by_itself, inputs=InputOptions(binning=1))
     assert np.shape(prepare_patterned(own).measurement.image) == (3, *SHAPE, 3)
+    half = psf().reshape(12, 2, 15, 2).sum(axis=(1, 3))
+    coarse = save_calibration(Calibration(half[None, None], np.array([[0.0, 0.0, 30e3]])), tmp_path / "half")
+    brought = prepare_patterned(replace(by_itself, calibration=coarse))
+    assert np.shape(brought.measurement.image) == (3, 12, 15, 3), "all colours by the calibration's pixels"
+    assert "--bin 1" not in brought.job.notes["Pixels"]
     asked = PatternedRequest(run=run, sheet=tmp_path / "patterns.npy", calibration=calibration)
     np.save(tmp_path / "patterns.npy", lights())
     whole = prepare_patterned(asked).measurement
