@@ -1,4 +1,4 @@
-"""Whether a photograph, its PSF or both are coded for the eye (sRGB, gamma), out of proportion to the light.
+"""Whether a photograph, or it and its PSF, are coded for the eye (sRGB, gamma): not in proportion to light.
 
 A convolution explains light, not its power: what was coded is explained far better once it is straightened.
 """
@@ -21,9 +21,6 @@ STRAIGHTER = 0.9
 to 0.39 (both coded: 0.72), of a measured pair to 0.59, of bars by propagation to 0.80. Of those in proportion
 to the light, the hand and seven pairs in three colours, as they are, with too much off, under even light,
 vignetted, mirrored, turned, clipped, 1.4 times as much and more."""
-PSF_STRAIGHTER = 0.55
-"""The same of a PSF alone, which is sharper then: the hand's falls to 0.49, the pairs', which were fitted, to
-0.64 and more though they are in proportion to the light."""
 SPEAKS = 0.05
 """Share of a photograph's contrast that is unexplained, from which it is asked at all: measured ones in
 proportion to the light leave 0.015 to 0.048 where nothing is missing, coded ones 0.07 to 0.12."""
@@ -31,32 +28,29 @@ proportion to the light leave 0.015 to 0.048 where nothing is missing, coded one
 
 @dataclass(frozen=True, slots=True)
 class Coded:
-    """What is coded."""
+    """What is coded: a photograph, and perhaps its PSF.
 
-    photograph: bool
+    A PSF alone is not asked about: a power takes from it what light of the room it lies on, too.
+    """
+
     psf: bool
 
     @property
     def words(self) -> str:
-        """``the photograph is``, ``both are``, ``the PSF is``."""
-        if self.photograph and self.psf:
-            return "both are"
-        return "the photograph is" if self.photograph else "the PSF is"
+        """``the photograph is``, ``both are``."""
+        return "both are" if self.psf else "the photograph is"
 
     @property
     def option(self) -> str:
         """Value of ``--srgb``."""
-        return "both" if self.photograph and self.psf else "photograph" if self.photograph else "psf"
+        return "both" if self.psf else "photograph"
 
     def straightened(self, photograph: Floats, psfs: Floats) -> tuple[Floats, Floats]:
         """Return both in proportion to the light."""
-        return (
-            straight(photograph) if self.photograph else photograph,
-            straight(psfs) if self.psf else psfs,
-        )
+        return straight(photograph), straight(psfs) if self.psf else psfs
 
 
-CODED = (Coded(True, False), Coded(True, True), Coded(False, True))
+CODED = (Coded(False), Coded(True))
 
 
 def coded(photograph: Floats, psfs: Floats, left: Left, *, asked: bool = False) -> Coded | None:
@@ -74,7 +68,6 @@ def coded(photograph: Floats, psfs: Floats, left: Left, *, asked: bool = False) 
     if given < SPEAKS and not asked:
         return None
     least = {how: left(*how.straightened(photograph, psfs)) / given for how in CODED}
-    least[CODED[-1]] *= STRAIGHTER / PSF_STRAIGHTER
     best = min(least, key=lambda how: least[how])
     return best if least[best] < STRAIGHTER else None
 

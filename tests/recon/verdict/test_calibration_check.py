@@ -38,6 +38,7 @@ from recon.verdict.calibration_check import (
     check_of,
     near_decoys,
 )
+from recon.verdict.coded import coded
 from recon.verdict.judge import Region, Verdict
 from tests.golden import inputs
 
@@ -375,13 +376,23 @@ def coded_for_the_eye(image: Image) -> Image:
 @pytest.mark.skipif(
     not (data_folder() / "diffusercam_hand").is_dir(), reason=f"the hand is not in {data_folder()}"
 )
-@pytest.mark.parametrize("coded", [False, True])
-def test_a_measured_photograph_that_is_coded_is_named_though_its_own_psf_wins(coded: bool) -> None:
+@pytest.mark.parametrize("is_coded", [False, True])
+def test_a_measured_photograph_that_is_coded_is_named_though_its_own_psf_wins(is_coded: bool) -> None:
     psfs, photograph = measured_set("hand")
-    photograph = coded_for_the_eye(photograph) if coded else block_mean(photograph, 8)
+    photograph = coded_for_the_eye(photograph) if is_coded else block_mean(photograph, 8)
     check = check_calibration(choose(Problem.of(photograph, block_mean(psfs[0], 8))))
     assert check is not None
-    assert check.fit is (Fit.OFF if coded else Fit.FITS)
-    if coded:
+    assert check.fit is (Fit.OFF if is_coded else Fit.FITS)
+    if is_coded:
         assert "the photograph is gamma-coded" in check.sentences[0]
         assert "--srgb photograph" in check.sentences[1]
+
+
+def test_a_psf_alone_is_not_called_coded_as_a_power_takes_a_pedestal_too() -> None:
+    photograph, psfs = np.eye(4, dtype=np.float32), np.full((1, 1, 4, 4), 0.5, np.float32)
+    psfs[..., 0, 0] = 1
+
+    def left(seen: Image, response: Image) -> float:
+        return 0.1 if seen is photograph and response is not psfs else 0.3
+
+    assert coded(photograph, psfs, left, asked=True) is None
