@@ -41,7 +41,7 @@ from instrument.reconstruction.preparation import (
     reduce_valid,
     saturated_pixels,
 )
-from instrument.reconstruction.straightened import straightened
+from instrument.reconstruction.straightened import require_no_counts, straightened, straightened_dark
 from recon.base.noise import NoiseModel, averaged_noise
 from recon.camera.factors import Pattern
 from recon.reconstruction.measurement import Measurement
@@ -129,6 +129,7 @@ def job_from_files(psf_file: Path | ImageFile, image_file: Path | ImageFile, inp
     Raises FileError or BenchError when a file cannot be used, the two do not belong together, or the window
     or binning does not fit.
     """
+    require_no_counts(inputs.noise, inputs.srgb)
     if isinstance(psf_file, Path) and psf_file.is_dir():
         other = "PSFs of several depths in a folder are given by --volume, a calibration by --calibration."
         raise FileError(psf_file, "is a folder; a file is expected.", other)
@@ -142,9 +143,11 @@ def job_from_files(psf_file: Path | ImageFile, image_file: Path | ImageFile, inp
     psf = replace(raw_psf, pixels=pixels)
     warnings = check_psf(psf, allow_saturated=inputs.allow_saturated)
     check_pair(psf, image, allow_mixed_depth=inputs.allow_mixed_depth, mosaic=pattern is not None)
+    dark, read = straightened_dark(inputs.dark, image, inputs.srgb), image
     psf, image = _in_proportion(psf, image, inputs)
     pair = matched(psf, image, mosaic=pattern is not None)
-    level, psf, match = matched_dark(inputs.dark, psf, image, pair), pair.psf, pair.image_binning
+    level = matched_dark(dark, psf, image, pair, apart=inputs.srgb in ("photograph", "psf"))
+    psf, match = pair.psf, pair.image_binning
     window = _window(crop, (psf.pixels.shape[0], psf.pixels.shape[1]))
     factor = auto_binning(window) if binning is None else binning
     if pattern is not None and binning is None and factor > 1:
@@ -168,7 +171,7 @@ def job_from_files(psf_file: Path | ImageFile, image_file: Path | ImageFile, inp
         _calibration_of(psf_pixels, psf),
         {
             "PSF": ", ".join((describe(psf), *mended_note(n_mended))),
-            "Image": describe(image),
+            "Image": describe(read),
             "Dark": level.reason,
             "Pixels": describe_window(crop, binning, factor, measurement),
             "Erased": erased.reason,
@@ -186,7 +189,7 @@ def job_from_files(psf_file: Path | ImageFile, image_file: Path | ImageFile, inp
         ),
         {
             "psf": source_record(raw_psf) | ({"mended_pixels": n_mended} if n_mended else {}),
-            "image": source_record(image),
+            "image": source_record(read),
             "dark": dark_record(level),
             "crop": None if crop is None else slices_record(crop.slices(psf.pixels.shape[:2])),
             "binning": factor,
@@ -221,12 +224,14 @@ def job_with(
     _refuse_constant(image)
     if inputs.srgb in ("psf", "both"):
         raise FileError(folder, "a calibration's PSFs are in proportion to the light.", "--srgb photograph.")
+    require_no_counts(inputs.noise, inputs.srgb)
+    dark, read = straightened_dark(inputs.dark, image, inputs.srgb), image
     image = straightened(image) if inputs.srgb == "photograph" else image
     shape = calibration.psfs.shape[-2:]
     match = matching_binning(image, shape, folder)
     pattern = pattern_of(inputs.mosaic, image)
     calibration, grey = matched_calibration(calibration, image, mosaic=pattern is not None)
-    level = calibrated_dark(inputs.dark, image, calibration, match)
+    level = calibrated_dark(dark, image, calibration, match)
     factor = inputs.binning or 1
     nearest = np.moveaxis(calibration.psfs[calibration.nearest_to_axis()], 0, -1)
     erased = erasures_of(inputs.erasures, image, None if pattern else nearest)
@@ -239,8 +244,7 @@ def job_with(
         reduced_calibration(calibration, crop, factor),
         {
             "Calibration": f"{folder}: {len(calibration.psfs)} PSFs of {shape[0]} x {shape[1]}",
-            "Image": describe(image)
-            + (f", binned {match} x {match} to the calibration" if match > 1 else ""),
+            "Image": describe(read) + (f", binned {match} x {match} to the calibration" if match > 1 else ""),
             "Dark": level.reason,
             "Pixels": describe_window(crop, factor, factor, measurement),
             "Erased": erased.reason,
@@ -251,7 +255,7 @@ def job_with(
         (*((grey,) if grey else ()), *_saturation(image, erased), *_suspicion(inputs, image)),
         {
             "calibration": str(folder.resolve()),
-            "image": source_record(image),
+            "image": source_record(read),
             "dark": dark_record(level),
             "image_binning": match,
             "crop": None if crop is None else slices_record(crop.slices((shape[0], shape[1]))),

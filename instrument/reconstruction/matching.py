@@ -122,10 +122,16 @@ def binned_words(psf: Sequence[int], image: Sequence[int], ours: int, theirs: in
     )
 
 
-def matched_dark(choice: DarkChoice, psf: ImageFile, image: ImageFile, pair: Matched) -> Dark:
-    """Return what is subtracted from both on the pixels that they come to; ``psf`` as it was read."""
+def matched_dark(
+    choice: DarkChoice, psf: ImageFile, image: ImageFile, pair: Matched, *, apart: bool = False
+) -> Dark:
+    """Return what is subtracted from both on the pixels that they come to; ``psf`` as it was read.
+
+    ``apart``: whether a dark frame's counts are the image's only.
+    """
     dark = dark_level(choice, psf, image)
-    if isinstance(dark.image, np.ndarray) and psf.pixels.shape[:2] != image.pixels.shape[:2]:
+    others = apart or psf.pixels.shape[:2] != image.pixels.shape[:2]
+    if isinstance(dark.image, np.ndarray) and others:
         own = dark_level("auto", psf, image)
         words = (
             f"{dark.reason} from the image, {float(np.mean(own.psf)):.4g} from the PSF (its darkest corner)"

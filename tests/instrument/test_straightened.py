@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
 import pytest
 
-from instrument.files.errors import FileError
+from instrument.files.errors import BenchError, FileError
 from instrument.files.images import ImageFile
-from instrument.reconstruction.job import job_from_files
+from instrument.reconstruction.job import job_from_files, source_record
 from instrument.reconstruction.options import InputOptions
 from instrument.reconstruction.straightened import SrgbChoice, straightened
 
@@ -55,3 +56,37 @@ def test_what_is_named_is_straightened_and_told(which: SrgbChoice) -> None:
         assert (likeness > 0.9999) is (which in (name, "both"))
     assert ("sRGB" in job.notes) is (which != "none")
     assert job.provenance["srgb"] == which
+
+
+def pair() -> tuple[ImageFile, ImageFile]:
+    rng = np.random.default_rng(1)
+    psf, image = (rng.integers(40, 255, SHAPE).astype(np.uint8) for _ in range(2))
+    return file(psf, "psf.png"), file(image)
+
+
+@pytest.mark.parametrize("which", ["photograph", "psf", "both"])
+def test_counts_that_a_straightened_file_does_not_have_are_refused(which: SrgbChoice) -> None:
+    with pytest.raises(BenchError, match=f"--dark 12 is in counts, which --srgb {which} changes"):
+        job_from_files(*pair(), InputOptions(dark=12.0, srgb=which))
+    if which != "psf":
+        with pytest.raises(BenchError, match="--noise is in counts"):
+            job_from_files(*pair(), InputOptions(noise=3.0, srgb=which))
+
+
+@pytest.mark.parametrize("which", ["photograph", "psf", "both"])
+def test_a_dark_frame_is_straightened_with_its_photograph_and_the_record_is_of_the_file(
+    which: SrgbChoice,
+) -> None:
+    psf, image = pair()
+    image = replace(image, metadata={"noise": {"read_noise_counts": 2, "counts_per_electron": 0.1}})
+    dark = file(np.full(SHAPE, 40, np.uint8), "dark.png")
+    job = job_from_files(psf, image, InputOptions(dark=dark, binning=1, srgb=which))
+    seen = [straightened(f).pixels.astype(np.float64) for f in (image, dark)]
+    light = image.pixels - 40.0 if which == "psf" else seen[0] - seen[1]
+    np.testing.assert_allclose(job.measurement, light, atol=1)
+    assert (job.known_noise is None) is (which != "psf")
+    assert job.provenance["image"] == source_record(image)
+    assert "uint8" in job.notes["Image"]
+    assert ("darkest corner" in job.notes["Dark"]) is (which != "both")
+    with pytest.raises(FileError, match="the dark frame has 16 bit"):
+        job_from_files(psf, image, InputOptions(dark=file(np.ones(SHAPE, np.uint16)), srgb=which))
