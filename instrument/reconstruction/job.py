@@ -249,6 +249,7 @@ def job_with(
             "Pixels": describe_window(crop, factor, factor, measurement),
             "Erased": erased.reason,
             **mosaic_note(pattern),
+            **srgb_note(inputs),
             **noise_note(noise_of(image)),
         },
         valid,

@@ -11,9 +11,10 @@ import pytest
 
 from instrument.files.errors import BenchError, FileError
 from instrument.files.images import ImageFile
-from instrument.reconstruction.job import job_from_files, source_record
+from instrument.reconstruction.job import job_from_files, job_with, source_record
 from instrument.reconstruction.options import InputOptions
 from instrument.reconstruction.straightened import SrgbChoice, straightened
+from recon.types import Calibration
 
 SHAPE = (40, 60)
 
@@ -90,3 +91,10 @@ def test_a_dark_frame_is_straightened_with_its_photograph_and_the_record_is_of_t
     assert ("darkest corner" in job.notes["Dark"]) is (which != "both")
     with pytest.raises(FileError, match="the dark frame has 16 bit"):
         job_from_files(psf, image, InputOptions(dark=file(np.ones(SHAPE, np.uint16)), srgb=which))
+
+
+def test_a_photograph_that_is_straightened_for_a_calibration_is_told_too() -> None:
+    psf, image = pair()
+    calibration = Calibration(psf.pixels[None, None].astype(np.float32), np.full((1, 3), np.nan))
+    job = job_with(calibration, Path("cal"), image, InputOptions(srgb="photograph"))
+    assert job.notes["sRGB"] == "photograph: made proportional to the light"
