@@ -38,7 +38,7 @@ from recon.verdict.calibration_check import (
     check_of,
     near_decoys,
 )
-from recon.verdict.coded import coded
+from recon.verdict.coded import Coded, coded
 from recon.verdict.judge import Region, Verdict
 from tests.golden import inputs
 
@@ -396,3 +396,20 @@ def test_a_psf_alone_is_not_called_coded_as_a_power_takes_a_pedestal_too() -> No
         return 0.1 if seen is photograph and response is not psfs else 0.3
 
     assert coded(photograph, psfs, left, asked=True) is None
+
+
+@pytest.mark.parametrize("n_depths", [1, 2])
+def test_a_volume_is_not_offered_what_only_pictures_have(
+    seen: tuple[Image, Image], monkeypatch: pytest.MonkeyPatch, n_depths: int
+) -> None:
+    photograph, psf = seen
+    psfs = np.stack([psf, transformed(psf, Transformation(scale=1.2))])[:n_depths, None]
+    places = np.array([(0, 0, Z_UM), (0, 0, 2 * Z_UM)])[:n_depths]
+    left = iter((0.8, 0.2))
+    monkeypatch.setattr(decoys, "coded", lambda *_, **__: Coded(psf=False))
+    monkeypatch.setattr(decoys._Small, "unexplained", lambda *_, **__: next(left))
+    problem = Problem.of(photograph, Calibration(psfs.astype(np.float32), places))
+    cause = decoys._cause(problem, FAR[0])
+    assert cause is not None
+    assert "the photograph is gamma-coded" in cause[0]
+    assert ("--srgb photograph" in cause[1]) is (n_depths == 1)
