@@ -27,7 +27,7 @@ FIRM, FIRMEST = 1e-2, 1e3
 NUMBERS = 5
 """Of a shade."""
 DEEPEST = 0.05
-"""Least of a shade relative to its brightest place."""
+"""Least of a shade relative to its brightest place; one that comes to it is none."""
 
 
 def shade_of(numbers: Floats, shape: tuple[int, int]) -> npt.NDArray[np.float32]:
@@ -39,8 +39,8 @@ def shade_of(numbers: Floats, shape: tuple[int, int]) -> npt.NDArray[np.float32]
         Of x^2, y^2, r^4, x and y in units of half the longer side from the centre: minus its logarithm.
     shape : (int, int)
     """
-    shade = np.exp(-np.tensordot(numbers, _terms(shape), 1))
-    relative: npt.NDArray[np.float32] = np.maximum(shade / shade.max(), DEEPEST).astype(np.float32)
+    fallen = np.tensordot(numbers, _terms(shape), 1)
+    relative: npt.NDArray[np.float32] = np.maximum(np.exp(fallen.min() - fallen), DEEPEST).astype(np.float32)
     return relative
 
 

@@ -19,7 +19,7 @@ import numpy.typing as npt
 
 from recon.base.blocks import whole_blocks
 from recon.camera.camera_model import CAMERAS
-from recon.camera.vignetting import NUMBERS, least_squares, shade_of
+from recon.camera.vignetting import DEEPEST, NUMBERS, least_squares, shade_of
 from recon.errors import InputError
 from recon.priors import Prior
 from recon.reconstruction.choice import Decision
@@ -405,8 +405,8 @@ def _shade_of(small: _Small, given: Floats) -> Floats | None:
     spared = explained if small.lacks(explained) else 0.0
     share = _least(lambda share: small.lacks(left2(share), spared), 1.0, SHADE_HALVINGS)
     fallen = small.beyond(given) ** 0.5 - max(small.beyond(explained), 1.0) ** 0.5
-    deep = -float(np.log(shade_of(share * numbers, shape).min()))
-    return share * numbers if fallen > TELLING * deep else None
+    least = float(shade_of(share * numbers, shape).min())
+    return share * numbers if least > DEEPEST and fallen > -TELLING * float(np.log(least)) else None
 
 
 def _shade_fitted(channel: Problem, usual2: float) -> Floats:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -195,9 +196,11 @@ class Measurement:
 
     def deviations(self, counts: Counts) -> npt.NDArray[np.float64]:
         """Return every channel's noise deviation, counts; under patterns its frames' root mean square."""
-        each = np.array(
-            [channel_noise(d, v, self.noise) for d, v in zip(counts.data, counts.valid, strict=True)]
-        )
+        shades: Iterable[Floats | None] = [None] * len(counts.data)
+        if self.vignetting is not None:
+            shades = self.like(self.vignetting, counts.data, "vignetting")
+        rows = zip(counts.data, counts.valid, shades, strict=True)
+        each = np.array([channel_noise(d, v, self.noise, shade) for d, v, shade in rows])
         of_channels = np.sqrt(np.mean(each.reshape(-1, self.frames) ** 2, axis=1))
         return each if self.patterns is None else np.repeat(of_channels, self.frames)
 
@@ -213,9 +216,19 @@ class Counts(NamedTuple):
     warnings: tuple[str, ...]
 
 
-def channel_noise(data: Floats, valid: npt.NDArray[np.bool_], noise: Noise) -> float:
-    """Return one channel's noise deviation in counts, at least what float32 can tell."""
-    if isinstance(noise, NoiseModel):
+def channel_noise(
+    data: Floats, valid: npt.NDArray[np.bool_], noise: Noise, shade: Floats | None = None
+) -> float:
+    """Return one channel's noise deviation in counts, at least what float32 can tell.
+
+    A ``noise`` that is known is that of the counts before they were divided by ``shade``, relative light.
+    """
+    if noise is not None and shade is not None:
+        model = noise if isinstance(noise, NoiseModel) else NoiseModel(noise, 0.0)
+        photons2 = model.counts_per_electron * np.maximum(data[valid], 0) / shade[valid]
+        grown2 = (model.read_noise / shade[valid]) ** 2 + photons2
+        deviation = float(np.sqrt(np.mean(grown2, dtype=np.float64)))
+    elif isinstance(noise, NoiseModel):
         deviation = noise.deviation(data[valid])
     elif noise is not None:
         deviation = float(noise)

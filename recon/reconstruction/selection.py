@@ -106,7 +106,10 @@ def _chosen(problem: Problem, on_stage: Stage | None = None) -> tuple[Problem, C
     restored = with_light_restored(problem, offset=not is_light)
     if restored is problem:
         return problem, choice
-    choice, added = choice_for(restored, on_stage), restored.measurement.background
+    before, added = choice, restored.measurement.background
+    choice = choice_for(restored, on_stage)
+    if added is None and before.background and choice.background:  # a shade that leaves stray light was that
+        return problem, before
     if added is None:
         return restored, choice
     why = f"an even offset of {-float(np.asarray(added)):.3g} counts is added instead"
@@ -114,10 +117,11 @@ def _chosen(problem: Problem, on_stage: Stage | None = None) -> tuple[Problem, C
     return restored, replace(choice, decisions=told)
 
 
-def with_background(problem: Problem, calibration: Calibration) -> Problem:
+def with_background(problem: Problem, calibration: Calibration, *, restoring: bool = True) -> Problem:
     """Return a problem of a given model with a smooth background where ``auto`` would have one; nobody said.
 
-    All of the calibration's PSFs tell whether there is one.
+    All of the calibration's PSFs tell whether there is one. ``restoring``: light that is missing may be given
+    back (:func:`with_light_restored`); not of streams, whose other frames are solved as they come.
     """
     options, model = problem.options, problem.model
     said = options.estimate_background is not None or problem.measurement.background is not None
@@ -127,7 +131,7 @@ def with_background(problem: Problem, calibration: Calibration) -> Problem:
         options, model="auto", choose=Overrides(model=model, binning=1, channels="all", beyond=False)
     )
     seen = Problem.of(problem.measurement, calibration, asked)
-    restored, choice = _chosen(seen)
+    restored, choice = _chosen(seen) if restoring else (seen, choice_for(seen))
     if restored is not seen:
         problem = Problem.of(restored.measurement, problem.calibration, options)
         problem = replace(problem, warnings=tuple(dict.fromkeys((*problem.warnings, *restored.warnings))))

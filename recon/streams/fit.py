@@ -116,7 +116,8 @@ def _found(problem: Problem, calibration: Calibration | None, binning: int) -> _
         if calibration is not None and not problem.smooth:
             # The quick solver of live pictures has no way for a background: that is no choice of anybody's.
             free = replace(problem, options=replace(problem.options, solver="auto"))
-            problem = with_background(free, reduced_calibration(calibration, binning, None))
+            calibration = reduced_calibration(calibration, binning, None)
+            problem = with_background(free, calibration, restoring=False)
             if problem.smooth:
                 advice = "There is smooth stray light: pictures would gain by a background (--background)."
         check = check_calibration(problem)

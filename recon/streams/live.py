@@ -104,6 +104,8 @@ class LiveReconstructor:
             raise InputError(f"{names}: not for live pictures, which take what fits into budget_ms.")
         if self._known.get("patterns") is not None:
             raise InputError("Live pictures are of one scene in one light: leave the patterns out.")
+        if self._known.get("vignetting") is not None:
+            raise InputError("Live pictures know no vignetting: divide the frames by it, and leave it out.")
         self._given = calibration
         places = calibration.source_positions_um if isinstance(calibration, Calibration) else None
         self._one_of_many = places is not None and len(places) > len(members_of_depths(places))

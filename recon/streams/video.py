@@ -102,7 +102,7 @@ def stream_problem(
     if choosing and not chosen:
         require_two_images(problem)
         if isinstance(calibration, Calibration):
-            problem = with_background(problem, calibration)
+            problem = with_background(problem, calibration, restoring=False)
     if doubt:
         problem = replace(problem, warnings=(*problem.warnings, doubt))
     if reason:

@@ -8,13 +8,18 @@ import pytest
 
 from recon import reconstruct
 from recon.base.blocks import block_mean
+from recon.base.noise import NoiseModel
 from recon.camera.vignetting import shade_of
 from recon.errors import InputError
 from recon.evaluation.measured_sets import data_folder, measured_set
 from recon.evaluation.scene import make_scene
 from recon.reconstruction.background import with_light_restored
 from recon.reconstruction.measurement import Measurement
+from recon.reconstruction.options import ReconstructionOptions
 from recon.reconstruction.problem import Problem
+from recon.reconstruction.selection import choose, with_background
+from recon.streams.live import LiveReconstructor
+from recon.types import Calibration
 
 Image = npt.NDArray[np.float32]
 BINNING = 16
@@ -83,6 +88,47 @@ def test_what_is_clear_or_lost_its_dark_level_is_not_shaded(hand: tuple[Image, I
             Problem.of(photograph - np.float32(taken_off * photograph.mean()), psf)
         )
         assert restored.measurement.vignetting is None
+
+
+@measured
+def test_stray_light_is_a_background_and_no_shade(hand: tuple[Image, Image]) -> None:
+    photograph, psf = hand
+    y, x = (np.linspace(-1, 1, n) for n in photograph.shape)
+    hill = np.exp(-((y[:, None] - 0.3) ** 2 + (x + 0.4) ** 2) / 0.3)
+    stray = 0.3 * photograph.mean() * hill / hill.mean()
+    chosen = choose(Problem.of((photograph + stray).astype(np.float32), psf))
+    assert chosen.measurement.vignetting is None
+    assert chosen.smooth
+
+
+@measured
+def test_a_film_is_told_of_no_shade_that_its_frames_do_not_get(hand: tuple[Image, Image]) -> None:
+    photograph, psf = hand
+    shaded = Problem.of(
+        photograph * cos4(photograph.shape, 0.5), psf, ReconstructionOptions(model="convolution")
+    )
+    calibration = Calibration(psf[None, None], np.zeros((1, 3)))
+    assert with_background(shaded, calibration).measurement.vignetting is not None
+    film = with_background(shaded, calibration, restoring=False)
+    assert film.measurement is shaded.measurement
+    assert not any("falls off" in words for words in film.warnings)
+
+
+@pytest.mark.parametrize("noise", [NoiseModel(20.0, 0.0), NoiseModel(5.0, 2.0), 30.0])
+def test_noise_that_is_known_grows_with_the_division(noise: NoiseModel | float) -> None:
+    shade = cos4((120, 160), 0.25)
+    light = 500 * shade
+    model = noise if isinstance(noise, NoiseModel) else NoiseModel(noise, 0.0)
+    sigma = np.sqrt(model.read_noise**2 + model.counts_per_electron * light)
+    counts = light + sigma * np.random.default_rng(0).standard_normal(light.shape)
+    measurement = Measurement(counts.astype(np.float32), noise, vignetting=shade)
+    told = measurement.deviations(measurement.counts())[0]
+    assert told == pytest.approx(np.std(counts / shade - 500), rel=0.03)
+
+
+def test_a_live_view_takes_no_shade() -> None:
+    with pytest.raises(InputError, match="vignetting"):
+        LiveReconstructor(np.eye(16, dtype=np.float32), vignetting=0.5)
 
 
 def test_a_known_shade_is_divided_by_and_none_is_looked_for() -> None:
