@@ -64,6 +64,10 @@ class Playback:
         self.shown: list[tuple[int, int]] = []
         self._stopped = threading.Event()
 
+    def computed_s(self) -> float:
+        """Return the seconds that it has computed: none, its frames are there."""
+        return 0.0
+
     def stream(self, n_buffers: int) -> FrameStream:
         """Return a stream."""
         return FrameStream(self, n_buffers)
