@@ -157,7 +157,8 @@ def metric_grid(grid: Grid, voxel_um: float | None = None) -> Grid:
     ----------
     grid : Grid
     voxel_um : float, optional
-        Edge of a cube. Default: as wide as the middle plane's pixels, as deep as the step beside it.
+        Edge of a cube. Default: as wide as the middle plane's pixels, as deep as the step beside it, or as
+        half the volume where that is less: of few planes the farthest step may be most of it.
 
     Raises InputError where depths or pitches are not known, there is one plane, planes share a depth, or a
     voxel is larger than the volume.
@@ -180,9 +181,9 @@ def metric_grid(grid: Grid, voxel_um: float | None = None) -> Grid:
         raise InputError(f"A voxel's edge is above 0 um, not {voxel_um:g}.")
     middle = min(n_z // 2, n_z - 2)
     made_of_um = float(steps[middle]), float(grid.pitch_um[order][n_z // 2])
-    deep, across = made_of_um if voxel_um is None else (voxel_um, voxel_um)
     near = _nearer(z)
-    span = z[-1] - z[0] + near + steps[-1] / 2
+    span = float(z[-1] - z[0] + near + steps[-1] / 2)
+    deep, across = (min(made_of_um[0], span / 2), made_of_um[1]) if voxel_um is None else (voxel_um, voxel_um)
     # A voxel lies on the nearest plane, none of the planes outside, and half a step beyond the outermost is
     # filled: by voxels that reach into it, each by its part there; none has its middle behind the diffuser.
     last = (z[-1] - z[0]) / deep

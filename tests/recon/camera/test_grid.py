@@ -181,6 +181,14 @@ def test_a_voxel_is_as_deep_as_the_step_beside_the_middle_plane(z_um, deep):
     np.testing.assert_allclose(np.diff(metric.z_um), deep)
 
 
+@pytest.mark.parametrize(("planes", "reach"), [(2, 3.6), (2, 20), (3, 4), (3, 20), (4, 8), (4, 20)])
+def test_few_planes_that_lie_far_apart_have_voxels_too(planes, reach):
+    z = 22e3 / np.linspace(1, 1 / reach, planes)
+    metric = metric_grid(Grid((planes, 9, 9), (4, 4), z, 2e-3 * z))
+    assert 2 <= len(metric.z_um) <= 2 * planes
+    assert metric.z_um[0] > 0
+
+
 @pytest.mark.parametrize(("n", "middle"), [(2, 1), (3, 1), (6, 3), (7, 3)])
 def test_a_voxel_is_as_wide_as_a_pixel_of_the_middle_plane(n, middle):
     z = 1000.0 + 10 * np.arange(n)
