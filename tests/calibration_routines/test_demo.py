@@ -209,9 +209,9 @@ def test_a_folder_that_cannot_be_made_is_named(tmp_path: Path) -> None:
 
 PROGRAM = """
 import sys
-from calibration_routines import demo
+from calibration_routines.demos.settings import DemoSettings
 from instrument.cli import main
-small = demo.DemoSettings(
+small = DemoSettings(
     preset="tiny", camera_binning=1, binning=1, z_mm=(60.0, 150.0), planes=3, scene_plane=1,
     half_field_deg=5.0, lights=4, chart_s=0.3, reconstruction_s=5.0, time_scale=1.0,
 )

@@ -114,7 +114,8 @@ def test_stray_light_is_looked_for_where_a_photograph_would_have_a_background_fo
     looked, judged, now_s = [], [], iter((5.0, 7.5))
     monkeypatch.setattr(fit, "time", SimpleNamespace(monotonic=lambda: next(now_s)))
 
-    def with_background(problem: SimpleNamespace, calibration: object) -> SimpleNamespace:
+    def with_background(problem: SimpleNamespace, calibration: object, *, restoring: bool) -> SimpleNamespace:
+        assert not restoring  # other frames are solved as they come
         looked.append((problem.options.solver, calibration))
         return SimpleNamespace(smooth=stray)
 

@@ -433,7 +433,8 @@ def test_a_camera_that_is_named_has_the_background_that_it_needs_and_two_images(
     asked: list[str] = []
     monkeypatch.setattr("recon.streams.video.require_two_images", lambda _: asked.append("images"))
     monkeypatch.setattr(
-        "recon.streams.video.with_background", lambda problem, _: asked.append("background") or problem
+        "recon.streams.video.with_background",
+        lambda problem, _, restoring: asked.append("background") or problem,
     )
     scene = make_scene("sparse-picture", size=24, grid=3)
     quick = stream_problem(scene.measurement, scene.calibration, choosing=False)
