@@ -405,8 +405,9 @@ def _shade_of(small: _Small, given: Floats) -> Floats | None:
     spared = explained if small.lacks(explained) else 0.0
     share = _least(lambda share: small.lacks(left2(share), spared), 1.0, SHADE_HALVINGS)
     fallen = small.beyond(given) ** 0.5 - max(small.beyond(explained), 1.0) ** 0.5
-    least = float(shade_of(share * numbers, shape).min())
-    return share * numbers if least > DEEPEST and fallen > -TELLING * float(np.log(least)) else None
+    least = shade_of(share * numbers, shape).min()
+    is_told = least > np.float32(DEEPEST) and fallen > -TELLING * float(np.log(least))
+    return share * numbers if is_told else None
 
 
 def _shade_fitted(channel: Problem, usual2: float) -> Floats:
