@@ -20,6 +20,8 @@ _LIGHTS = 5
 """Lights whose pictures are shown."""
 _MARGIN = 32
 """Pixels at each edge of the sensor's grid that the scenes leave dark."""
+_LEGEND = 0.28
+"""Height of the legend below the curves, of theirs."""
 
 
 def optics_figure(compared: Comparison) -> Figure:
@@ -96,7 +98,9 @@ def _errors(axes: Axes, compared: Comparison) -> None:
         lights = sorted(found.psnr_db)
         axes.semilogx(lights, [found.psnr_db[light] for light in lights], "o-", color=colour, label=name)
     style(axes, "Picture against the scene", "photons on the sensor", "PSNR, dB")
-    axes.legend(loc="lower right", frameon=False)
+    low, high = axes.get_ylim()
+    axes.set_ylim(low - _LEGEND * (high - low), high)  # the legend's own place: no line runs there
+    axes.legend(loc="lower center", frameon=False, ncols=2, fontsize=9, columnspacing=1.0, handlelength=1.2)
 
 
 def _show(axes: Axes, image: Image, title: str, top: float = 0.0) -> None:
