@@ -5,6 +5,7 @@ from __future__ import annotations
 import functools
 import re
 from collections.abc import Mapping
+from typing import Literal
 
 from recon.base.declare import in_other_words
 
@@ -54,6 +55,14 @@ def in_the_window(text: str) -> str:
 def in_the_log(text: str) -> str:
     """Return a message as ``in_the_window``, also without the terminal's options: no form is at hand."""
     return in_other_words(in_the_window(text), (), str, lambda flag: f"“{flag[2:].replace('-', ' ')}”")
+
+
+def level_of(text: str) -> tuple[Literal["info", "warning"], str]:
+    """Return how much a warning of a command says, and it without its first word, which a log's own has."""
+    word, colon, rest = text.partition(": ")
+    if colon and word in ("Note", "Warning"):
+        return ("info" if word == "Note" else "warning"), rest[:1].upper() + rest[1:]
+    return "warning", text
 
 
 def with_signs(text: str) -> str:

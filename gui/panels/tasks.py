@@ -40,7 +40,7 @@ from gui.widgets.building import (
 from gui.widgets.orientation import orientation_of, read_turned
 from gui.widgets.sweep_views import Picture
 from gui.widgets.tab_order import tab_in_order
-from gui.words import in_the_window, with_signs
+from gui.words import in_the_window, level_of, with_signs
 from instrument.files.calibration_file import newest_calibration
 from instrument.files.orientation import Kind
 from instrument.tasks import CHARTS, TASKS, VIDEOS
@@ -355,8 +355,9 @@ class TasksPanel(Panel):
             self.words.setVisible(bool(self.words.toPlainText()))
             return
         if told.kind == "warn":
-            self.session.log("warning", text)
-            text = f"⚠ {text}"
+            level, said = level_of(text)
+            self.session.log(level, said)
+            text = f"⚠ {said}" if level == "warning" else text
         self.words.appendPlainText(text)
         self.words.show()
 

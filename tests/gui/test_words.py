@@ -12,7 +12,7 @@ import pytest
 
 import instrument
 from gui.session_news import LogBridge
-from gui.words import in_the_log, in_the_window
+from gui.words import in_the_log, in_the_window, level_of
 
 ROOT = Path(instrument.__file__).parents[1]
 _IN_WINDOW = ("recon", "instrument", "calibration_routines")
@@ -104,3 +104,9 @@ def test_the_log_leaves_paths_as_they_are(path: str) -> None:
 
 def test_the_log_names_options_behind_brackets_and_quotes() -> None:
     assert in_the_log("--psf, (--calibration) or '--dry-run'") == "“psf”, (“calibration”) or '“dry run”'"
+
+
+def test_a_warning_of_a_command_says_no_word_that_the_log_says() -> None:
+    assert level_of("Warning: frames move.") == ("warning", "Frames move.")
+    assert level_of("Note: 3 depths are few.") == ("info", "3 depths are few.")
+    assert level_of("one.tif: 3 frames are damaged") == ("warning", "one.tif: 3 frames are damaged")
