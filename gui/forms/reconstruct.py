@@ -191,8 +191,9 @@ class ReconstructForm(QWidget):
         return ", ".join(shown)
 
     # While it runs -------------------------------------------------------------------------------
-    def set_running(self, running: bool) -> None:
-        """Let it be started, or stopped."""
+    def set_running(self, running: bool, *, keeps: bool = True) -> None:
+        """Let it be started, or stopped, which ``keeps`` what there is then or nothing."""
+        self.stop.setText("Stop and keep" if keeps or not running else "Stop")
         self.start.setEnabled(not running)
         self.explain.setEnabled(not running)
         self.stop.setEnabled(running)
@@ -345,10 +346,10 @@ def reconstruct_job(work: ReconstructionWork, context: JobContext) -> Written:
 
 @dataclass(frozen=True, slots=True)
 class Explained:
-    """What would be chosen (nothing, where a model was asked for), and what all of it takes."""
+    """What would be chosen (nothing, where a model was asked for), and what all of it takes, once known."""
 
     decisions: tuple[Decision, ...]
-    takes: Forecast
+    takes: Forecast | None = None
 
 
 def explain_job(request: PictureRequest | VolumeRequest, context: JobContext) -> Explained:
@@ -356,10 +357,11 @@ def explain_job(request: PictureRequest | VolumeRequest, context: JobContext) ->
     prepared = request.prepare()
     context.check()
     chosen = request.explain(prepared).decisions if request.options.model == "auto" else ()
+    context.report(Explained(chosen))  # read while its time is tried
 
     def stage(share: float, what: str) -> None:
         context.check()
-        context.offer(lambda: SoFar(share, what, prepared))
+        context.offer(lambda: SoFar(share, f"Trying what it takes: {what}", prepared))
 
     return Explained(chosen, request.forecast(prepared, stage))
 

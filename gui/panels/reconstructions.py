@@ -347,30 +347,37 @@ class ReconstructionsPanel(Panel):
             return None
         job = self.jobs.compute(f"Explaining {request.file.name}", partial(explain_job, request))
         self._explaining = job
-        self._begun(job, "Looking at PSFs and photograph …")
-        job.progressed.connect(lambda so_far: self.form.show_progress(so_far.share, so_far.note))
+        self._begun(job, "Looking at PSFs and photograph …", keeps=False)
+        job.progressed.connect(self._explaining_so_far)
         job.succeeded.connect(self._explained)
         job.cancelled.connect(lambda _: self.form.show_progress(0.0, "Stopped."))
         job.ended.connect(lambda: setattr(self, "_explaining", None))
         return job
 
-    def _begun(self, job: Job, words: str) -> None:
+    def _begun(self, job: Job, words: str, *, keeps: bool = True) -> None:
         """Show in the form that a job of it runs, and how it ends."""
         self.follow(job)
-        self.form.set_running(True)
+        self.form.set_running(True, keeps=keeps)
         self.form.show_progress(0.0, words)
         job.failed.connect(lambda why: self.form.show_progress(0.0, self.in_its_words(why).splitlines()[0]))
         job.ended.connect(lambda: self.form.set_running(False))
 
+    def _explaining_so_far(self, so_far: SoFar | Explained) -> None:
+        if isinstance(so_far, SoFar):
+            self.form.show_progress(so_far.share, so_far.note)
+        else:
+            self._explained(so_far)
+
     def _explained(self, explained: Explained) -> None:
-        facts = [("Will take", str(explained.takes))]
+        facts = [] if explained.takes is None else [("Will take", str(explained.takes))]
         for decision in explained.decisions:
             facts.append((decision.name.capitalize(), f"{decision.value}: {decision.why}"))
             steps = (("up", decision.up), ("down", decision.down))
             facts += [("", f"one step {way}: {option}") for way, option in steps if option is not None]
         self.facts.show_facts([(name, self.in_its_words(words)) for name, words in facts])
         why = "; what was chosen, and why, is below the picture" if explained.decisions else ""
-        self.form.show_progress(0.0, f"Will take {explained.takes}{why}.")
+        takes = "Trying what it takes …" if explained.takes is None else f"Will take {explained.takes}"
+        self.form.show_progress(0.0, f"{takes}{why}.")
 
     def _stop(self) -> None:
         if self._explaining is not None:

@@ -6,6 +6,7 @@ import json
 import re
 import threading
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -152,11 +153,24 @@ def test_a_volume_by_mouse_and_slices_by_click(qtbot: QtBot, panel: Reconstructi
 
 
 def test_explain_says_what_would_be_chosen_and_reconstructs_nothing(
-    qtbot: QtBot, panel: ReconstructionsPanel, files
+    qtbot: QtBot, panel: ReconstructionsPanel, files, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     fill(panel, VOLUME, files, "psfs")
+    forecast, tried = VolumeRequest.forecast, threading.Event()
+
+    def later(self: VolumeRequest, *given: Any) -> Any:
+        tried.wait()
+        return forecast(self, *given)
+
+    monkeypatch.setattr(VolumeRequest, "forecast", later)
     qtbot.mouseClick(panel.form.explain, Qt.MouseButton.LeftButton)
+    assert panel.form.stop.text() == "Stop", "there is nothing to keep"
     qtbot.waitUntil(lambda: "Model" in panel.facts.toPlainText(), timeout=WAIT_MS)
+    assert panel.form.note.text().startswith("Trying what it takes")
+    tried.set()
+    qtbot.waitUntil(lambda: "Will take" in panel.facts.toPlainText(), timeout=WAIT_MS)
+    qtbot.waitUntil(panel.form.start.isEnabled, timeout=WAIT_MS)
+    assert panel.form.stop.text() == "Stop and keep"
     assert panel.job is None
     assert re.match(r"Will take about .* ms an iteration, \d+ of them", panel.form.note.text())
     assert panel.facts.toPlainText().lstrip().startswith("Will take")
