@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-from dataclasses import dataclass, replace
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -58,6 +58,11 @@ class Measurement:
     vignetting : array, (height, width) or as ``image``, optional
         Relative light on the pixels, which the PSF does not have: the image less its background is divided by
         it. None: looked for where light is missing (:mod:`recon.reconstruction.background`).
+    lines : array, (height, width) or as ``image``, optional
+        Offsets that whole rows and columns share, counts: subtracted as the background is. None: looked for
+        (:mod:`recon.base.shared_lines`).
+    found : mapping
+        What of this was fitted to the photograph itself, as results record it.
     """
 
     image: npt.ArrayLike
@@ -66,6 +71,8 @@ class Measurement:
     erasures: npt.ArrayLike | None = None
     patterns: npt.ArrayLike | None = None
     vignetting: npt.ArrayLike | None = None
+    lines: npt.ArrayLike | None = None
+    found: Mapping[str, Any] = field(default_factory=dict)
 
     __repr__ = brief
 
@@ -139,12 +146,14 @@ class Measurement:
         return Counts(data, valid, warnings)
 
     def light_of(self, counts: Floats) -> Floats:
-        """Return channels less their background, and divided by the vignetting.
+        """Return channels less their background and what lines share, and divided by the vignetting.
 
         Raises InputError where either is shaped otherwise, or the vignetting is no relative light.
         """
         if self.background is not None:
             counts = counts - self.like(self.background, counts, "background")
+        if self.lines is not None:
+            counts = counts - self.like(self.lines, counts, "offset of lines")
         if self.vignetting is not None:
             shade = self.like(self.vignetting, counts, "vignetting")
             if not shade.min() > 0:

@@ -199,7 +199,8 @@ class Problem:
         """
         if self.reduction is not None:
             raise InputError("This problem was reduced for one photograph: choose anew for another.")
-        measurement = replace(self.measurement, image=image)
+        # Lines' offsets are noise: of each photograph its own.
+        measurement = replace(self.measurement, image=image, lines=None)
         counts = measurement.channels()
         if counts.shape != self.data.shape or measurement.flat != self.flat:
             raise InputError(
@@ -443,6 +444,11 @@ class Problem:
         whole[:, :, rows, columns] = np.moveaxis(volume, -1, 0)[channels] * self.gains / scale
         return whole
 
+    @property
+    def _given(self) -> Measurement:
+        """The measurement on the pixels and channels that were given."""
+        return self.measurement if self.reduction is None else self.reduction.given.measurement
+
     def provenance(self) -> Mapping[str, Any]:
         """Return what is known of it, JSON-compatible."""
         from recon.base.declare import record
@@ -456,6 +462,7 @@ class Problem:
             "model": self.model,
             "model_reason": self.reason,
             **({"patterns": self.measurement.frames} if self.patterned else {}),
+            **({"fitted_to_the_photograph": dict(found)} if (found := self._given.found) else {}),
             **({"refocused": made} if (made := self.calibration.provenance.get("refocused")) else {}),
             "options": record(self.options),
         }

@@ -35,7 +35,7 @@ from recon.types import Calibration
 from recon.verdict.evidence import evidence_of, not_judged, observations, unsettled_by
 from recon.verdict.judge import Verdict, method_name, unlike_any, verdict_on
 
-FACTS = tuple(f.name for f in fields(Measurement) if f.name != "image")
+FACTS = tuple(f.name for f in fields(Measurement) if f.name not in ("image", "found"))
 """What is known of a measurement, by the names that :func:`reconstruct` takes them by."""
 
 

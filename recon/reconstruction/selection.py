@@ -10,6 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from recon.base.blocks import whole_blocks
+from recon.base.shared_lines import shared_lines
 from recon.camera.camera_model import CAMERAS, Extent, ModelName
 from recon.errors import InputError
 from recon.reconstruction.background import (
@@ -85,6 +86,7 @@ def choose(
     """
     if options is not None:
         problem = replace(problem, options=options)
+    problem = without_shared_lines(problem)
     if problem.model != "auto":
         if problem.options.choose not in (None, Overrides()):
             raise InputError(
@@ -115,6 +117,54 @@ def _chosen(problem: Problem, on_stage: Stage | None = None) -> tuple[Problem, C
     why = f"an even offset of {-float(np.asarray(added)):.3g} counts is added instead"
     told = tuple(replace(d, why=why) if d.name == "background" else d for d in choice.decisions)
     return restored, replace(choice, decisions=told)
+
+
+def without_shared_lines(problem: Problem) -> Problem:
+    """Return a problem whose photograph is less the offsets that whole rows or columns share, which is told.
+
+    The problem itself where there are none, where somebody gave them or said that there is no background, and
+    in patterned light.
+    """
+    measurement = problem.measurement
+    said = measurement.lines is not None or problem.options.estimate_background is False
+    if said or problem.patterned:
+        return problem
+    counts = measurement.counts()
+    psfs, one = problem.depths.central, len(problem.depths.central[0]) == 1
+    found = [
+        shared_lines(data, valid, float(noise), psfs[:, 0 if one else c])
+        for c, (data, valid, noise) in enumerate(zip(counts.data, counts.valid, problem.noise, strict=True))
+    ]
+    if not any(found):
+        return problem
+    offsets = np.stack([np.zeros(problem.sensor_shape, np.float32) if f is None else f.image for f in found])
+    each = [{} if f is None else f.deviations for f in found]
+    most = {
+        name: max(one.get(name, 0.0) for one in each) for name in sorted({k for one in each for k in one})
+    }
+    lines = " and ".join(
+        f"{'columns' if name == 'columns' else 'rows'} by {d:.3g}" for name, d in most.items()
+    )
+    measurement = replace(
+        measurement,
+        lines=offsets[0] if problem.flat else np.moveaxis(offsets, 0, -1),
+        found={**measurement.found, "shared_lines_counts": most},
+    )
+    counts = measurement.counts()
+    deviation = measurement.deviations(counts).astype(np.float32)
+    told = (
+        f"Whole lines of the photograph differ from their neighbours: {lines} counts (standard deviation; "
+        f"a pixel's noise is {float(problem.noise.max()):.3g}), as light through its PSF does not. That was "
+        "taken off as far as it can be told from light. As a rule the camera reads whole lines with a noise "
+        "of their own: more light, or several frames averaged, make it less. --no-background leaves it."
+    )
+    return replace(
+        problem,
+        measurement=measurement,
+        data=np.where(counts.valid, counts.data / deviation[:, None, None], 0).astype(np.float32),
+        noise=deviation,
+        warnings=(*problem.warnings, told),
+    )
 
 
 def with_background(problem: Problem, calibration: Calibration, *, restoring: bool = True) -> Problem:
