@@ -123,12 +123,12 @@ def measure(shape: tuple[int, int], rate: float, seconds: float) -> dict[str, An
             "cpu_share": spent.process_s / spent.wall_s,
             "window_thread_share": spent.thread_s / spent.wall_s,
         }
-        session.stop_live()
+        session.viewing.hold()
         until(lambda: not session.live.is_running)
         idle = _Clock()
         QTest.qWait(int(1e3 * seconds / 2))
         standing = _Clock().since(idle)
-        session.start_live()
+        session.viewing.start()
         window.hide()
         QTest.qWait(1000)
         before = _Clock()

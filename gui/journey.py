@@ -134,7 +134,7 @@ def light_of(frame: Frame | None) -> str:
 
 def _light_now(session: BenchSession) -> str:
     newest = session.live.newest()
-    is_held = newest is None and not session.live.is_running and not session.live_wanted
+    is_held = newest is None and not session.live.is_running and not session.viewing.wanted
     return "held" if is_held else light_of(newest)
 
 
@@ -146,7 +146,7 @@ def facts_of(session: BenchSession, made: Made) -> Facts:
         failed=tuple(kind for kind, state in states.items() if state == "failed"),
         opening="opening" in states.values() or (bool(states) and set(states.values()) == {"closed"}),
         light=_light_now(session),
-        stuck=session.live_failure,
+        stuck=session.viewing.failure,
         shown=slm is not None and session.is_open("slm") and bool(slm.displayed.any()),
         made=made,
     )

@@ -20,6 +20,7 @@ from drivers.errors import DeviceError, LimitError, StoppedError
 from drivers.frame import Frame, FrameMetadata
 from gui.background import NewestOnly
 from gui.jobs import BusyError, Job, JobContext, JobRunner, Work, joined, words_for
+from gui.live_upkeep import LiveUpkeep
 from gui.session_news import DeviceState, LogBridge, OperatorRequest, is_gone, name_of
 from gui.words import in_the_log, in_the_window
 from instrument.bench.bench import Bench
@@ -36,9 +37,6 @@ _STOP_REPEAT_S = 0.05
 _STOP_WAIT_S = 10.0
 """A job that has not ended by then is named; STOP goes on, for the job may be about to start a move."""
 _WATCH_MS = 500
-_AGAIN_S = 1.0
-"""After which a live view that did not start is tried again; doubled each time it does not, up to:"""
-_LONGEST_AGAIN_S = 30.0
 
 
 class BenchSession(QObject):
@@ -97,6 +95,7 @@ class BenchSession(QObject):
         self.lights = LightLog(partial(light_words, self.bench))
         self.jobs = JobRunner(self)
         self.jobs.job_ended.connect(self._job_ended)
+        self.viewing = LiveUpkeep(self.jobs, self.live, self._may_view, self)
         self.kept = KeptWithBench(config.data_folder)
         """Presets, places, what was used last; read when the bench is opened."""
         self._keeper = NewestOnly(self.jobs, "Keeping it with the bench", partial(self.log, "error"))
@@ -107,15 +106,6 @@ class BenchSession(QObject):
         """Whether the end has begun."""
         self._all_closed = threading.Event()
         self.is_closed = False
-        self.live_wanted = True
-        """Whether the live view is to run whenever nothing else needs the camera."""
-        self._live_job: Job | None = None
-        self.live_failure = ""
-        """Why the live view does not start although the camera is open; empty: it does, or was not tried."""
-        self._live_again = QTimer(self)
-        self._live_again.setSingleShot(True)
-        self._live_again.timeout.connect(self.start_live)
-        self._live_again_s = _AGAIN_S
         self._requests: list[OperatorRequest] = []
         self._from_thread.connect(self._do, Qt.ConnectionType.QueuedConnection)
         self._handler = LogBridge(lambda *line: self._in_window(self.log, *line))
@@ -149,6 +139,9 @@ class BenchSession(QObject):
     def is_ready(self) -> bool:
         """Whether opening every device was tried, and the camera is open."""
         return self._watch.isActive() and "camera" in self.kinds and self.is_open("camera")
+
+    def _may_view(self) -> bool:
+        return self.is_open("camera") and not self.is_closing
 
     # Opening -------------------------------------------------------------------------------------
     def open(self) -> Job:
@@ -227,26 +220,8 @@ class BenchSession(QObject):
     def _tried(self, kind: str) -> None:
         if self.state(kind).condition == "opening":
             self._set_state(kind, DeviceState("failed", "It was not opened."))
-        if kind == "camera" and self.is_open("camera") and self.live_wanted:
-            self.start_live()
-
-    # The live view -------------------------------------------------------------------------------
-    def start_live(self) -> None:
-        """Start the live view; it also goes on by itself after a run."""
-        self.live_wanted = True
-        if self.is_open("camera") and not self.jobs.is_busy("camera") and not self.is_closing:
-            with contextlib.suppress(BusyError):  # a run goes on: the live view does after it
-                self._live_job = self.jobs.device(
-                    "Starting the live view", lambda _: self.live.start(), {"camera"}, quiet=True
-                )
-
-    def stop_live(self) -> None:
-        """End the live view until it is started again."""
-        self.live_wanted = False
-        self._forget_live_failure()
-        if self.live.is_running:
-            with contextlib.suppress(BusyError):  # a run has ended it already
-                self.jobs.device("Ending the live view", lambda _: self.live.stop(), {"camera"}, quiet=True)
+        if kind == "camera" and self.is_open("camera") and self.viewing.wanted:
+            self.viewing.start()
 
     # Jobs ----------------------------------------------------------------------------------------
     def camera_job(self, title: str, work: Callable[[Camera], Any], *, idle: bool = False) -> Job:
@@ -295,37 +270,21 @@ class BenchSession(QObject):
         ]
         return ", ".join([*words, "SIMULATED"] if self.state("camera").simulated else words)
 
-    def _forget_live_failure(self) -> None:
-        self.live_failure, self._live_again_s = "", _AGAIN_S
-        self._live_again.stop()
-
-    def _live_tried(self, job: Job) -> None:
-        """Try again later where the live view did not start: the camera may only have been busy."""
-        self._live_job = None
-        if job.error is None or not self.is_open("camera"):
-            self._forget_live_failure()
-        elif job.state.value != "cancelled" and self.live_wanted and not self.is_closing:
-            if not isinstance(job.error, StoppedError):
-                self.live_failure = words_for(job.error)
-            self._live_again.start(round(1e3 * self._live_again_s))
-            self._live_again_s = min(2 * self._live_again_s, _LONGEST_AGAIN_S)
-
     def _job_ended(self, job: Job) -> None:
         self.lights.note()
-        again = job is self._live_job and job.error is not None and self.live_failure == words_for(job.error)
-        if job.error is not None and not again:  # told when it came first
+        if job.error is not None and not self.viewing.was_told(job):
             self._note_error(job)
         elif job.lanes and not job.quiet:
             self.log("debug", f"{job.title}: done.")
-        if job is self._live_job:
-            self._live_tried(job)
-        elif job.lanes and self.live_wanted and not self.live.is_running and not self._stopping:
-            self.start_live()
+        if self.viewing.is_start(job):
+            self.viewing.tried(job)
+        elif job.lanes and not self._stopping:
+            self.viewing.goes_on()
 
     def _note_error(self, job: Job) -> None:
         error = job.error
         assert error is not None
-        expected = StoppedError if job is self._live_job else (StoppedError, LimitError)
+        expected = StoppedError if self.viewing.is_start(job) else (StoppedError, LimitError)
         if job.quiet and isinstance(error, expected):
             return
         if job.state.value == "cancelled":
@@ -419,8 +378,8 @@ class BenchSession(QObject):
         else:
             self.log("info", "Stopped: light off, nothing moving.")
         self.stopped.emit()
-        if self.live_wanted and not self.is_closing:
-            self.start_live()
+        if self.viewing.wanted:
+            self.viewing.start()
 
     # The end -------------------------------------------------------------------------------------
     def close(self) -> None:
@@ -429,8 +388,7 @@ class BenchSession(QObject):
             return
         self.is_closing = True
         self._watch.stop()
-        self.live_wanted = False
-        self._forget_live_failure()
+        self.viewing.give_up()
         for job in self.jobs.jobs:
             job.cancel()
         self.stop()
@@ -495,7 +453,7 @@ class BenchSession(QObject):
         if self._states[kind] != state:
             self._states[kind] = state
             if kind == "camera" and state.condition != "open":
-                self._forget_live_failure()  # the camera's state says what is wrong from here on
+                self.viewing.forget_failure()
             self.device_changed.emit(kind)
 
     def _in_window(self, call: Callable[..., object], *arguments: object) -> None:

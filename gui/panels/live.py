@@ -67,6 +67,10 @@ class LivePanel(Panel):
         self._pictured = False
         """Whether there was a frame in the light that it begins with, or a coarse picture of it."""
 
+    def wholes(self) -> list[QWidget]:
+        """Return the picture and the camera's form: they have most of the panel's widgets."""
+        return [self.picture, self.form]
+
     def parts(self) -> Iterator[None]:
         """Make the widgets."""
         session = self.session
@@ -112,7 +116,7 @@ class LivePanel(Panel):
         session.stop_pressed.connect(self._leave_dark)
         self.put_below(ReconnectButton(session, ("camera",), self))
         tip = "It is tried again by itself, too, after a while"
-        self.again_button = button("Start the live view again", tip, session.start_live)
+        self.again_button = button("Start the live view again", tip, session.viewing.start)
         self.again_button.hide()
         self.put_below(self.again_button)
         every(self, _LOOK_MS, self.look).setTimerType(Qt.TimerType.PreciseTimer)
@@ -122,7 +126,7 @@ class LivePanel(Panel):
     def _make_buttons(self, row: QWidget) -> None:
         tip = "Run the camera, or hold the last frame (Ctrl+L)"
         self.live_button = button("▶ Live", tip, self.toggle_live, checkable=True)
-        self.live_button.setChecked(self.session.live_wanted)
+        self.live_button.setChecked(self.session.viewing.wanted)
         tip = "Take a photograph and keep it in the runs' folder (Ctrl+K)"
         self.snap_button = button("Snap", tip, self.snap)
         self.reconstruct_button = button(
@@ -181,7 +185,7 @@ class LivePanel(Panel):
         if what == EXPOSE:
             self.form.expose()
         elif what == AGAIN:
-            self.session.start_live()
+            self.session.viewing.start()
 
     # Frames --------------------------------------------------------------------------------------
     def look(self) -> None:
@@ -263,12 +267,12 @@ class LivePanel(Panel):
         age_s = (time.monotonic_ns() - frame.metadata.host_time_ns) / 1e9
         if age_s < _PATIENCE_S + 3e-3 * frame.metadata.exposure_ms:
             return
-        since = "Held" if not self.session.live_wanted else "Old picture, no other has come"
-        self.picture.view.caution_against(f"{since} for {duration(age_s)}", old=self.session.live_wanted)
+        since = "Held" if not self.session.viewing.wanted else "Old picture, no other has come"
+        self.picture.view.caution_against(f"{since} for {duration(age_s)}", old=self.session.viewing.wanted)
 
     def _waits(self) -> bool:
         """Tell where no frame comes although one is wanted, and why; return whether it is so."""
-        stuck = "" if self.session.jobs.exclusive_job is not None else self.session.live_failure
+        stuck = "" if self.session.jobs.exclusive_job is not None else self.session.viewing.failure
         self.again_button.setVisible(bool(stuck))
         if stuck:
             self.status.setText(f"The live view does not start: {stuck}")
@@ -311,11 +315,11 @@ class LivePanel(Panel):
     # What the operator does ----------------------------------------------------------------------
     def toggle_live(self) -> None:
         """Run the camera, or hold the last frame."""
-        if self.session.live_wanted:
-            self.session.stop_live()
+        if self.session.viewing.wanted:
+            self.session.viewing.hold()
         else:
-            self.session.start_live()
-        self.live_button.setChecked(self.session.live_wanted)
+            self.session.viewing.start()
+        self.live_button.setChecked(self.session.viewing.wanted)
 
     def snap(self) -> None:
         """Take a photograph into the runs' folder."""

@@ -65,7 +65,7 @@ def bench_text() -> str:
 def panel(qtbot: QtBot, make_session: Callable[[], BenchSession], tmp_path: Path) -> HologramsPanel:
     session = make_session()
     Path(session.config.path).write_text(aligned())
-    session.live_wanted = False
+    session.viewing.wanted = False
     with qtbot.waitSignal(session.opened, timeout=WAIT_MS):
         session.open()
     assert session.is_open("slm"), session.state("slm").text

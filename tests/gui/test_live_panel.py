@@ -63,7 +63,7 @@ def test_the_scene_is_lit_before_the_first_frame(
     with qtbot.waitSignal(session.opened, timeout=WAIT_MS):
         session.open()
     qtbot.waitUntil(lambda: session.bench.scene_lit, timeout=WAIT_MS)
-    session.stop_live()
+    session.viewing.hold()
     session.switch_light(LightState.DARK)
     qtbot.waitUntil(lambda: not session.bench.scene_lit, timeout=WAIT_MS)
     qtbot.wait(100)
@@ -130,11 +130,11 @@ def test_the_picture_says_when_it_was_taken_in_what_light_and_when_it_is_old(
     monkeypatch.setattr("gui.panels.live._PATIENCE_S", 0.0)
     live.toggle_live()
     qtbot.waitUntil(lambda: view.caution.startswith("Held for"), timeout=WAIT_MS)
-    live.session.live_wanted = True  # as while the camera is lost
+    live.session.viewing.wanted = True  # as while the camera is lost
     live.count()
     assert view.caution.startswith("Old picture")
     assert view.item.opacity() < 0.5
-    live.session.start_live()
+    live.session.viewing.start()
     qtbot.waitUntil(lambda: not view.caution and view.item.opacity() == 1.0, timeout=WAIT_MS)
 
 
@@ -143,7 +143,7 @@ def test_a_view_that_did_not_start_says_why_and_is_tried_again(
 ) -> None:
     session, camera = live.session, live.session.bench.camera
     with qtbot.waitSignal(session.jobs.job_ended, timeout=WAIT_MS):
-        session.stop_live()
+        session.viewing.hold()
 
     def busy(_: int = 8) -> None:
         raise LimitError(camera.name, "is busy.", "Wait for its other user.")
@@ -151,22 +151,22 @@ def test_a_view_that_did_not_start_says_why_and_is_tried_again(
     logged: list[str] = []
     session.logged.connect(lambda _, text: logged.append(text))
     start = camera.start_sequence
-    monkeypatch.setattr("gui.session._AGAIN_S", 0.02)
+    monkeypatch.setattr("gui.live_upkeep._AGAIN_S", 0.02)
     monkeypatch.setattr(camera, "start_sequence", busy)
-    session.start_live()
-    qtbot.waitUntil(lambda: session._live_again_s >= 0.08, timeout=WAIT_MS)  # tried three times
+    session.viewing.start()
+    qtbot.waitUntil(lambda: session.viewing._again_s >= 0.08, timeout=WAIT_MS)  # tried three times
     qtbot.waitUntil(live.again_button.isVisible, timeout=WAIT_MS)
     assert "is busy" in live.status.text()
     assert sum("is busy" in text for text in logged) == 1, "told once"
     window.strip.look()
     assert "is busy" in window.strip.words.text()
     assert window.strip.button.text() == "Try again now"
-    session._live_again.stop()
+    session.viewing._again.stop()
     monkeypatch.setattr(camera, "start_sequence", start)
     qtbot.mouseClick(window.strip.button, Qt.MouseButton.LeftButton)
     qtbot.waitUntil(lambda: session.live.is_running, timeout=WAIT_MS)
     qtbot.waitUntil(live.again_button.isHidden, timeout=WAIT_MS)
-    assert not session.live_failure
+    assert not session.viewing.failure
 
 
 def test_a_reason_goes_with_the_camera(
@@ -175,20 +175,20 @@ def test_a_reason_goes_with_the_camera(
     """A camera that was lost is connected again, not tried again."""
     session, camera = live.session, live.session.bench.camera
     with qtbot.waitSignal(session.jobs.job_ended, timeout=WAIT_MS):
-        session.stop_live()
+        session.viewing.hold()
 
     def busy(_: int = 8) -> None:
         raise LimitError(camera.name, "is busy.", "Wait for its other user.")
 
     monkeypatch.setattr(camera, "start_sequence", busy)
-    session.start_live()
+    session.viewing.start()
     qtbot.waitUntil(live.again_button.isVisible, timeout=WAIT_MS)
     session.note_failure(DeviceError(camera.name, "was unplugged."), surely=True)
     assert session.state("camera").condition == "failed"
     live.count()
     assert live.again_button.isHidden()
-    assert not session.live_failure
-    assert not session._live_again.isActive()
+    assert not session.viewing.failure
+    assert not session.viewing._again.isActive()
 
 
 def test_what_comes_is_shown_coarsely_first_and_says_so(
