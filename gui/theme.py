@@ -175,6 +175,7 @@ def change_theme(name: str, window: QWidget, wholes: Sequence[QWidget]) -> Gener
     assert isinstance(app, QApplication)
     parts = [*wholes, *window.findChildren(QDialog)]
     window.setUpdatesEnabled(False)
+    shown: list[QWidget] = []
     try:
         app.setPalette(_palette())
         holding = {window}
@@ -193,9 +194,18 @@ def change_theme(name: str, window: QWidget, wholes: Sequence[QWidget]) -> Gener
                 yield from restyled(part)
         for holder in holding:
             yield from _recoloured(holder)
+        shown = [part for part in parts if isValid(part) and part.isVisible() and not part.isWindow()]
+        for part in shown:
+            part.setUpdatesEnabled(False)
+        window.setUpdatesEnabled(True)
+        for part in shown:
+            yield TURN
+            if isValid(part):
+                part.setUpdatesEnabled(True)
     finally:
-        if isValid(window):
-            window.setUpdatesEnabled(True)
+        for part in (window, *shown):
+            if isValid(part):
+                part.setUpdatesEnabled(True)
     yield TURN
     for part in parts:
         yield from restyled(part)

@@ -101,7 +101,7 @@ class OptionsForm(QWidget):
             self.fields[option.name], self.widgets[option.name] = field, field.widget
             yield
         folded = [field for field in self.fields.values() if self._is_folded(field)]
-        usual, self._seldom = QWidget(), QWidget()
+        self._usual, self._seldom = QWidget(), QWidget()
         self.more = QToolButton()
         self.more.setText(FOLDED[0])
         self.more.setCheckable(True)
@@ -111,9 +111,9 @@ class OptionsForm(QWidget):
         self.more.setToolTip(", ".join(field.bare_label for field in folded) or FOLDED[0])
         self.more.toggled.connect(self._fold)
         self._seldom.hide()
-        fill(self, usual, in_row(self.more, None), self._seldom, None, margins=(0, 6, 0, 2))
+        fill(self, self._usual, in_row(self.more, None), self._seldom, None, margins=(0, 6, 0, 2))
         self.more.setVisible(bool(folded))  # once it has its place
-        yield from self._fill(usual, [field for field in self.fields.values() if field not in folded])
+        yield from self._fill(self._usual, [field for field in self.fields.values() if field not in folded])
         yield from self._fill(self._seldom, folded)
         for name, field in self.fields.items():
             field.edited.connect(self._edited)
@@ -121,6 +121,10 @@ class OptionsForm(QWidget):
             field.settled.connect(partial(self.settled.emit, name))
         self._state = self._raw()
         self._update_enabled()
+
+    def wholes(self) -> list[QWidget]:
+        """Return what takes a theme for itself, once it is made: what is seen first, and what is folded."""
+        return [self._usual, self._seldom]
 
     # Values --------------------------------------------------------------------------------------
     def values(self) -> dict[str, Any] | None:

@@ -85,8 +85,8 @@ class HologramsPanel(Panel):
         across = split(left := QWidget())
         fill(self.body, across)
         self.form = self._make_form()
-        self._place = scrolled(self.form)
-        fill(left, (self._place, 1), margins=(0, 0, 6, 0))
+        place = scrolled(self.form)
+        fill(left, (place, 1), margins=(0, 0, 6, 0))
         yield
         yield from self.form.parts()
         self._names = SuggestedName(self.jobs, self.form, session.runs_folder / "holograms", ".png")
@@ -190,8 +190,8 @@ class HologramsPanel(Panel):
         )
 
     def wholes(self) -> list[QWidget]:
-        """Return the form, which has many of the panel's widgets."""
-        return [self._place]
+        """Return the form's halves: it has many of the panel's widgets."""
+        return self.form.wholes()
 
     # What is asked for ---------------------------------------------------------------------------
     def order(self, *, preview: bool = False) -> HologramOrder:

@@ -97,6 +97,10 @@ class LiveReconstructionPanel(Panel):
         for offered in options_of(ReconstructionOptions):
             _ = offered.words
 
+    def wholes(self) -> list[QWidget]:
+        """Return the form's halves: it has most of the panel's widgets."""
+        return self.options.wholes()
+
     def parts(self) -> Iterator[None]:
         """Make the widgets."""
         session = self.session

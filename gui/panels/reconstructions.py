@@ -161,8 +161,8 @@ class ReconstructionsPanel(Panel):
         return self.form.options
 
     def wholes(self) -> list[QWidget]:
-        """Return the form, which has half of the panel's widgets."""
-        return [self.form]
+        """Return the form's halves: it has half of the panel's widgets."""
+        return self.form.options.wholes()
 
     # Results -------------------------------------------------------------------------------------
     def refresh(self) -> None:
