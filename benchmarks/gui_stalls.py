@@ -62,6 +62,11 @@ class Turns:
         turns, self.ms = sorted(self.ms, reverse=True), []
         return turns
 
+    def forget(self) -> None:
+        """Begin anew: neither the turns so far nor what was done since the last one count."""
+        self._turned()
+        self.ms = []
+
 
 class Stopper:
     """Clicks STOP again and again from a thread of its own, and times how long it is until dark and still."""
