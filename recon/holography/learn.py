@@ -19,8 +19,9 @@ import numpy.typing as npt
 
 from recon.errors import InputError
 from recon.holography.display import Display
-from recon.holography.learned import Learned, Panel, terms
+from recon.holography.learned import Learned, terms
 from recon.holography.model import HologramModel
+from recon.holography.panel import Panel
 from recon.holography.pose import NODES
 from recon.holography.target import ORDER, Target
 
@@ -83,6 +84,16 @@ class Lesson:
     helps: bool
 
 
+def nothing_learned(display: Display, *, levels: int = 5, orders: tuple[int, int] = (4, 6)) -> Learned:
+    """Return what is to be learned of a display before anything is: the display as it is described."""
+    amplitude, phase = (np.zeros(len(terms(order))) for order in orders)
+    light = display.dc.amplitude
+    response = np.zeros((levels + 1, 2))
+    response[:, 0] = display.dc.modulated
+    dc = np.array([light.real, light.imag])
+    return Learned(response, dc, np.zeros(2), amplitude, phase, np.zeros((2, 4)), 1.0)
+
+
 @dataclass(frozen=True, slots=True)
 class _Unknown:
     """Some of the unknowns: how many, how large they may be expected, and the step of their differences."""
@@ -97,7 +108,7 @@ class _Fit:
 
     def __init__(self, display: Display, looks: Sequence[Look]) -> None:
         self.start = display
-        learned = display.learned or Learned.nothing(display)
+        learned = display.learned or nothing_learned(display)
         mixed = np.maximum(np.abs(learned.crosstalk_px), _FIRST_CROSSTALK)
         self.learned = replace(learned, crosstalk_px=mixed)
         self._panel: Panel | None = None

@@ -28,11 +28,11 @@ from recon.base.namespace import array_namespace
 from recon.base.threads import get_threads, in_blocks
 from recon.errors import InputError
 from recon.holography.display import Display
-from recon.holography.learned import Panel
 from recon.holography.losses import loss_of
 from recon.holography.near import NearField
 from recon.holography.on_device import OnDevice, Tables
 from recon.holography.options import HologramOptions
+from recon.holography.panel import Panel
 from recon.holography.target import BESIDE, Target, Window, band_of, weights_on
 
 ComplexArray = npt.NDArray[Any]

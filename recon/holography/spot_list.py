@@ -18,9 +18,9 @@ import numpy.typing as npt
 
 from recon.errors import InputError
 from recon.holography.display import Display
-from recon.holography.learned import Panel
 from recon.holography.optimise import Hologram, HologramRecord, HologramStop
 from recon.holography.options import HologramOptions
+from recon.holography.panel import Panel
 
 Array = npt.NDArray[Any]
 

@@ -50,7 +50,7 @@ from recon.holography import (
     spot_array,
 )
 from recon.holography.display import DcTerm, no_mask
-from recon.holography.learned import Learned
+from recon.holography.learn import nothing_learned
 from recon.holography.pose import Pose
 from recon.holography.scores import compare
 from recon.holography.spot_list import SpotField
@@ -159,7 +159,7 @@ def test_without_a_lens_the_fields_size_is_said_and_photographs_are_refused(caps
         display_of_pattern(config, ((96, 128), 8.0), facts)
     with pytest.raises(BenchError, match="80 mm away without a lens"):  # as the window asks for it
         photograph_hologram(None, [], display, None)
-    taught, still = Learned.nothing(display), np.zeros((1, 1, 2))
+    taught, still = nothing_learned(display), np.zeros((1, 1, 2))
     learned = Alignment(Pose(), {}, still, 1.0, {}, display.mask.shape, simulated=True, learned=taught)
     assert learned.of(replace(display, distance_mm=None)).learned is not None
     with pytest.raises(FileError, match="learned behind the display's Fourier lens"):

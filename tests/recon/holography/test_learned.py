@@ -18,9 +18,10 @@ from recon.holography import (
     compute_hologram,
     random_mask,
 )
-from recon.holography.learn import Look, learn_display, unexplained
-from recon.holography.learned import Learned, Panel
+from recon.holography.learn import Look, learn_display, nothing_learned, unexplained
+from recon.holography.learned import Learned
 from recon.holography.optimise import HologramStop
+from recon.holography.panel import Panel
 from recon.holography.spot_list import SpotField
 
 SHAPE, K = (24, 32), 2
@@ -37,7 +38,7 @@ TARGET = Target(np.where((Y - 25) ** 2 + (X - 36) ** 2 < 250, 1.0, 0.3), white=1
 
 def wrong(crosstalk_px: float = 0.2, phase: float = 0.3) -> Display:
     """Return a display with all kinds of errors."""
-    nothing = Learned.nothing(PLAIN)
+    nothing = nothing_learned(PLAIN)
     level = np.linspace(0, 1, len(nothing.response))
     response = 0.9 * (1 - 0.2 * np.sin(np.pi * level) ** 2) * np.exp(0.3j * level)
     rng = np.random.default_rng(5)

@@ -22,7 +22,7 @@ from recon.holography import (
     hologram_limit,
     random_mask,
 )
-from recon.holography.learned import Learned
+from recon.holography.learn import nothing_learned
 from recon.holography.limit import (
     COLUMNS,
     DENSE,
@@ -120,7 +120,7 @@ def test_it_can_be_interrupted_and_is_a_bound_all_the_same():
     with pytest.raises(InputError, match="loss 'frequency'"):
         hologram_limit(display, Target(picture()), HologramOptions(loss="none"))
     with pytest.raises(InputError, match="learned from photographs"):
-        hologram_limit(display.taught(Learned.nothing(display)), Target(picture()))
+        hologram_limit(display.taught(nothing_learned(display)), Target(picture()))
 
 
 def hologram(*psnr_db: float, reason: HologramStop = HologramStop.ITERATIONS) -> Hologram:

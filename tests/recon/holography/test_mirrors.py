@@ -19,7 +19,7 @@ from recon.holography import (
     random_mask,
 )
 from recon.holography.display import no_mask
-from recon.holography.learned import Learned
+from recon.holography.learn import nothing_learned
 from recon.holography.scores import seen_image
 from recon.holography.target import FIRST_ORDER, Window
 from recon.holography.variables import Mirrors, coded
@@ -103,7 +103,7 @@ def test_the_first_order_of_fringes_is_the_field_over_pi() -> None:
         ({"mirrors": "optimised", "complex_slm": True}, BARE, "leave --complex"),
         ({"mirrors": "optimised", "method": "one-step"}, BARE, "lbfgs"),
         ({"mirrors": "optimised", "loss": "none"}, BARE, "'frequency' and 'spatial'"),
-        ({"mirrors": "optimised"}, BARE.taught(Learned.nothing(BARE)), "of a phase SLM"),
+        ({"mirrors": "optimised"}, BARE.taught(nothing_learned(BARE)), "of a phase SLM"),
     ],
 )
 def test_what_mirrors_cannot_do_is_refused(options, display: Display, words: str) -> None:
