@@ -30,7 +30,7 @@ from gui.panels.live import LivePanel
 from gui.session import BenchSession
 from gui.theme import apply_theme
 from instrument.bench.config_file import parse_config
-from instrument.bench.photograph import LightState
+from instrument.bench.lit import LightState
 
 SIZES = {"0.3 MP": (480, 640), "1.0 MP": (1024, 1024), "1.3 MP": (1024, 1280), "5.5 MP": (2160, 2560)}
 BENCH = """

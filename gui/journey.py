@@ -10,7 +10,8 @@ from drivers.frame import Frame
 from gui.session import BenchSession
 from gui.session_news import OwnFiles, names_of
 from instrument.bench.config import BenchConfig
-from instrument.bench.photograph import PHOTOGRAPHS, SPOILT
+from instrument.bench.photograph import SPOILT
+from instrument.bench.photograph_file import PHOTOGRAPHS
 from instrument.files.atomic import DOUBTFUL
 from instrument.files.calibration_file import newest_calibration
 from instrument.files.results import find_results

@@ -16,7 +16,8 @@ from calibration_routines.psf.sweep_plan import SWEEP
 from drivers.frame import FrameMetadata
 from gui.widgets.entry import quantity
 from gui.widgets.image_view import usual_levels
-from instrument.bench.photograph import Progress, read_snapshot
+from instrument.bench.photograph import Progress
+from instrument.bench.photograph_file import read_snapshot
 from instrument.files.errors import percent
 from instrument.files.images import read_image
 from instrument.runs.inspection import Verification, verify

@@ -26,7 +26,7 @@ from gui.words import in_the_log, in_the_window
 from instrument.bench.bench import Bench
 from instrument.bench.config import BenchConfig, Kind
 from instrument.bench.kept import KeptWithBench
-from instrument.bench.photograph import LightState, switch_light
+from instrument.bench.lit import LightState, switch_light
 from instrument.files.errors import BenchError
 from instrument.live.light_log import LightLog, light_words
 from instrument.live.live_camera import LiveCamera

@@ -21,12 +21,10 @@ from gui.widgets.camera_controls import CameraForm
 from gui.widgets.entry import NumberEdit
 from gui.widgets.live_picture import LivePicture
 from gui.widgets.record_bar import RecordBar
-from instrument.bench.photograph import (
+from instrument.bench.lit import LightState, led_pattern, light_of
+from instrument.bench.photograph_file import (
     PHOTOGRAPHS,
-    LightState,
     check_photograph_file,
-    led_pattern,
-    light_of,
     photograph_name,
     write_snapshot,
 )

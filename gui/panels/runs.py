@@ -30,7 +30,7 @@ from gui.widgets.building import (
 )
 from gui.widgets.image_view import ImageView
 from gui.widgets.orientation import follow_orientation
-from instrument.bench.photograph import PHOTOGRAPHS
+from instrument.bench.photograph_file import PHOTOGRAPHS
 from instrument.files.errors import count
 from instrument.runs.inspection import RunSummary, runs_and_photographs, summary
 from instrument.runs.run import RunCondition

@@ -16,7 +16,7 @@ from gui.jobs import Job, JobCancelledError, JobContext
 from gui.panel import Panel
 from gui.widgets.building import button, every, fill, label
 from gui.widgets.entry import NumberEdit
-from instrument.bench.photograph import Lit
+from instrument.bench.lit import Lit
 from instrument.files.atomic import SPARE_BYTES, free_bytes, there_now
 from instrument.files.errors import FileError, count, duration, size
 

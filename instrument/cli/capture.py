@@ -10,15 +10,9 @@ import numpy as np
 import typer
 
 from instrument.bench.bench import Bench
-from instrument.bench.photograph import (
-    SPOILT,
-    LightState,
-    Snapshot,
-    check_photograph_file,
-    photograph_name,
-    switch_light,
-    write_snapshot,
-)
+from instrument.bench.lit import LightState, switch_light
+from instrument.bench.photograph import SPOILT, Snapshot
+from instrument.bench.photograph_file import check_photograph_file, photograph_name, write_snapshot
 from instrument.cli.app import (
     App,
     BenchOption,

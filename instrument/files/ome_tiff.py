@@ -90,7 +90,7 @@ def tiff_facts(tiff: tifffile.TiffFile) -> dict[str, Any]:
 def photograph_fields(facts: Mapping[str, Any], planes: int = 1) -> dict[str, Any]:
     """Return OME's fields of one photograph of so many planes, as tifffile takes them, and all its facts.
 
-    ``facts`` are those of :func:`instrument.bench.photograph.snapshot_facts`, as far as they are there.
+    ``facts`` are those of :func:`instrument.bench.photograph_file.snapshot_facts`, as far as they are there.
     """
     fields: dict[str, Any] = {"MapAnnotation": annotation(facts)}
     plane: dict[str, float | str] = {}

@@ -8,7 +8,7 @@ from collections.abc import Callable
 
 from drivers.frame import FrameMetadata
 from instrument.bench.bench import Bench
-from instrument.bench.photograph import LightState, led_pattern, light_of
+from instrument.bench.lit import LightState, led_pattern, light_of
 
 NOTHING_LIT = "nothing lit"
 _KEPT = 200

@@ -9,7 +9,8 @@ from pathlib import Path
 
 import numpy as np
 
-from instrument.bench.photograph import PHOTOGRAPHS, Progress
+from instrument.bench.photograph import Progress
+from instrument.bench.photograph_file import PHOTOGRAPHS
 from instrument.files.errors import FileError, frames_in_words, ranges
 from instrument.files.figures import save_figure
 from instrument.files.images import image_metadata

@@ -16,7 +16,7 @@ from drivers.common.stream_reader import StreamReader
 from drivers.errors import DeviceError, StoppedError
 from drivers.frame import Frame, FrameMetadata
 from instrument.bench.bench import Bench
-from instrument.bench.photograph import Lit
+from instrument.bench.lit import Lit
 from instrument.files.atomic import SPARE_BYTES, free_bytes
 from instrument.files.errors import BenchError, count, size
 from instrument.files.record import plain

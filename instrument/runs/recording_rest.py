@@ -11,7 +11,7 @@ from typing import Any
 from drivers.device import DeviceIdentity
 from instrument.bench.bench import Bench
 from instrument.bench.camera_settings import camera_settings, restore_camera
-from instrument.bench.photograph import Lit
+from instrument.bench.lit import Lit
 from instrument.files.errors import BenchError
 from instrument.files.record import value_of
 from instrument.runs.inspection import run_paths

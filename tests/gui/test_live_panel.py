@@ -25,7 +25,7 @@ from gui.panels.runs import RunsPanel
 from gui.session import BenchSession
 from gui.widgets.device_settings import DeviceSettings
 from gui.widgets.image_view import ImageView
-from instrument.bench.photograph import LightState
+from instrument.bench.lit import LightState
 from instrument.files.errors import BenchError
 from instrument.files.images import read_image
 from instrument.live.frame_view import FrameFigures, not_stretched

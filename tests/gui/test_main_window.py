@@ -25,7 +25,7 @@ from gui.theme import RED, THEMES
 from gui.widgets.building import every
 from gui.widgets.dialogues import Question, TextWindow, choose_path
 from instrument.bench.bench import Bench
-from instrument.bench.photograph import LightState
+from instrument.bench.lit import LightState
 from tests.gui.looks import faults
 
 WAIT_MS = 60_000

@@ -13,12 +13,13 @@ import numpy as np
 import pytest
 
 import drivers.simulated.camera
-import instrument.bench.photograph
+import instrument.bench.photograph_file
 import instrument.runs.log
 from drivers.frame import FrameMetadata, filled_in_by_bench, over_frames
 from instrument.bench.bench import Bench, open_bench
 from instrument.bench.config_file import parse_config
-from instrument.bench.photograph import LightState, read_snapshot, write_snapshot
+from instrument.bench.lit import LightState
+from instrument.bench.photograph_file import read_snapshot, write_snapshot
 from instrument.files.errors import FileError
 from instrument.files.images import read_image, write_image
 from instrument.plan import OFF, Light, Part, Plan, PlanError, SourceGrid
@@ -59,7 +60,7 @@ class Warmer(FrameMetadata):
 @pytest.fixture
 def later_reader(monkeypatch: pytest.MonkeyPatch) -> None:
     """Read with the later version's declaration."""
-    for module in (instrument.runs.log, instrument.bench.photograph):
+    for module in (instrument.runs.log, instrument.bench.photograph_file):
         monkeypatch.setattr(module, "FrameMetadata", Warmer)
 
 
