@@ -52,13 +52,17 @@ def click_tab(qtbot: QtBot, window: MainWindow, name: str) -> None:
 
 
 def choose(qtbot: QtBot, panel: SweepsPanel, name: str) -> None:
-    """Choose a routine in the drop-down list by two clicks."""
+    """Choose a routine in the drop-down list by two clicks.
+
+    The list is asked for anew after every wait: it is Qt's own, and PySide takes what it holds of it for
+    deleted when another part of the window goes, as "Opening ..." does where a panel takes its place.
+    """
     qtbot.mouseClick(panel.choice, LEFT)
-    popup = panel.choice.view()
-    qtbot.waitUntil(popup.isVisible)
-    row = [routine.name for routine in panel.routines].index(name)
-    place = popup.visualRect(panel.choice.model().index(row, 0)).center()
+    qtbot.waitUntil(lambda: panel.choice.view().isVisible())
     qtbot.wait(QApplication.doubleClickInterval() + 50)  # a list takes no click sooner
+    row = [routine.name for routine in panel.routines].index(name)
+    popup = panel.choice.view()
+    place = popup.visualRect(panel.choice.model().index(row, 0)).center()
     qtbot.mouseMove(popup.viewport(), place)
     qtbot.mouseClick(popup.viewport(), LEFT, pos=place)
     qtbot.waitUntil(lambda: panel.routine.name == name)
