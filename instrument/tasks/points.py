@@ -129,14 +129,22 @@ def points(desk: Desk, files: PointFiles, options: PointOptions) -> Done:
             "photograph does not tell them from noise, or from a point beside them."
         )
     if found.misfit is not None and found.misfit > _LEFT and (found.unexplained or 0.0) > _UNEXPLAINED:
-        desk.warn(
-            f"Warning: these points leave {found.misfit:.1f} times the noise of the photograph, "
-            f"{found.unexplained:.0%} of what is seen of them: there is more in it than points, or its PSFs "
-            "are others. Places may be off by more than their deviations."
-        )
+        desk.warn(f"Warning: {left_over(len(found), found.misfit, found.unexplained or 0.0)}")
     if ends := int(found.at_end.sum()):
         desk.warn(f"Warning: {_at_the_ends(ends, grid.shape[0], fitted=found.misfit is not None)}")
     return Done((files.out,))
+
+
+def left_over(points: int, misfit: float, unexplained: float) -> str:
+    """Say how much of the photograph the points do not explain, and why that may be."""
+    why = "there is more in it than points, or its PSFs are others."
+    if not points:
+        return f"the photograph holds {misfit:.1f} times its noise, and no point explains any of it: {why}"
+    share = f"{unexplained:.0%} of" if unexplained < 1 else "more than"
+    return (
+        f"these points leave {misfit:.1f} times the noise of the photograph, {share} what is seen of them: "
+        f"{why} Places may be off by more than their deviations."
+    )
 
 
 def _of_film(desk: Desk, files: PointFiles, options: PointOptions) -> Done:

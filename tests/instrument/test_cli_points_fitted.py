@@ -16,6 +16,7 @@ import tifffile
 from instrument.cli import main
 from instrument.files.calibration_file import save_calibration
 from instrument.reconstruction.video_files import VideoPictures, create_output
+from instrument.tasks.points import left_over
 from instrument.volumes.grid_facts import grid_facts
 from recon.analysis import point_places
 from recon.camera.grid import Grid
@@ -241,3 +242,11 @@ def test_a_film_of_pictures_is_refused(tmp_path: Path, capsys: pytest.CaptureFix
     VideoPictures(path, write=True).write(0, np.ones((8, 8), np.float32))
     assert main(["points", str(path), "--out", str(tmp_path / "points.csv")]) == 2
     assert "is a film of pictures" in " ".join(capsys.readouterr().err.split())
+
+
+def test_what_points_do_not_explain_is_told_as_a_share_only_where_it_is_one() -> None:
+    assert "4.0 times the noise of the photograph, 12% of what is seen" in left_over(3, 4.0, 0.12)
+    assert "more than what is seen of them" in left_over(3, 4.0, 5.3e18)
+    none = left_over(0, 76.3, 5.3e18)
+    assert none.startswith("the photograph holds 76.3 times its noise, and no point explains any of it")
+    assert "Places" not in none
