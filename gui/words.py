@@ -38,6 +38,7 @@ _NO_PATH, _NO_FOLDER = r"(?<![/\\\w])", r"(?![^()]*\)[/\\])"
 """Neither in a folder nor the name of one: a file is found by its name as it is."""
 _SIGNS = (
     (re.compile(r"(?<=\d) um\b(?![/\\])"), " µm"),
+    (re.compile(r"\bin um\b(?![/\\])"), "in µm"),
     (re.compile(r"\+-(?=[ \d])"), "±"),
     (re.compile(rf"{_NO_PATH}led_array(?= opened|:| \({_NO_FOLDER})"), "LED array"),
     (re.compile(rf"{_NO_PATH}slm(?= \({_NO_FOLDER})"), "SLM"),

@@ -174,7 +174,7 @@ class TasksPanel(Panel):
 
     def _chosen(self) -> None:
         name, entry = self.name, TASKS[self.name]
-        self.about.setText(f"{entry.help[:1].upper()}{entry.help[1:]}.")
+        self.about.setText(with_signs(f"{entry.help[:1].upper()}{entry.help[1:]}."))
         if name in self._pages:
             self._show_form(name)
             return

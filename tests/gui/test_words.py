@@ -30,6 +30,7 @@ _IN_WINDOW = ("recon", "instrument", "calibration_routines")
             "“Verify runs” in Files names every damaged frame.",
         ),
         ("Make one: diffuserbench align mask", "Make one: Alignment"),
+        ("x, y, z in um, as a table; in um/raw.tif", "x, y, z in µm, as a table; in um/raw.tif"),
         ("with 6 ('reconstruct --video --warm').", "with 6 (“Reconstruct a recording” in Files)."),
         ("is no video of 'reconstruct --video'.", "is no video of “Reconstruct a recording” in Files."),
         ("install diffuserbench again", "install diffuserbench again"),
