@@ -91,6 +91,12 @@ def _made(folder: Path) -> dict[str, dict[str, Any]]:
             plan.unlink(missing_ok=True)
             shots._do("plan", "illumination", "--bench", lamp, "--lattice", 2, plan)
             shots._do("run", plan, "--bench", lamp)
+    volume = folder / "volume.ome.zarr"
+    if not volume.exists():
+        planes = sorted(runs.glob("*sweep/calibration"))[0]
+        shots._do(
+            "reconstruct", "-i", folder / "photo.tif", "--volume", planes, "--bin", 4, "-n", 30, "-o", volume
+        )
     lit, sheet = sorted(runs.glob("*active-illumination"))[-2:]
     old, new = sorted(runs.glob("*sweep/calibration"))[:2]
     recording = sorted(runs.glob("*recording"))[-1]
@@ -108,7 +114,8 @@ def _made(folder: Path) -> dict[str, dict[str, Any]]:
         "chart photograph": {"image": photo, **at, "binning": 4, "budget_s": 20.0},
         "chart hologram": {"targets": (portrait,), "slm": "27x48", "bench": None, "budget_s": 20.0},
         "chart calibrations": {"folders": (old, new), "image": photo, **light, "budget_s": 20.0},
-        "stability": {"list_maps": True},
+        "points": {"volume": volume, "fit": True},
+        "stability": {"names": ("light",), "method": ("wiener",)},
         "limit": {"target": portrait, "iterations": 3},
         "spots": {"spots": "2x2", "iterations": 3},
         "analyze": {"calibration": new, "points": False},
