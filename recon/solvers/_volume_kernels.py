@@ -183,18 +183,15 @@ def _divergence_row(r: Any, below: Any, vz: Any, v: Any) -> None:
 
 
 @njit(nogil=True, cache=True)
-def z_reflection(
-    S: Any, x: Any, deeper: Any, w: Any, p: Any, isotropic: bool, rows: Any, state: Any, out: Any
-) -> None:
+def z_reflection(S: Any, x: Any, deeper: Any, w: Any, p: Any, isotropic: bool, rows: Any, out: Any) -> None:
     """Reflections of the z differences of one plane after its update, without updating it.
 
     What the worker that starts on the next plane needs to know.
     """
     ny = x.shape[0]
-    ignored = np.zeros(STATISTICS)
+    state, ignored, r = np.empty_like(S[0]), np.zeros(STATISTICS), np.zeros_like(x[0])
     for y in range(ny):
         state[:] = S[y]
-        r = rows[SCRATCH_ROWS]
         _update_row(state, x[y], x[y + 1 if y + 1 < ny else 0], deeper[y], rows, r, w, p, isotropic, ignored)
         out[y] = rows[0]
 

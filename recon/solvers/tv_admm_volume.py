@@ -137,11 +137,10 @@ class LeanTotalVariation(VolumeAdmm):
             first[z] = fft.irfft(self.X[z].copy(), nx)
             above = fft.irfft(self.X[z - 1].copy(), nx)
             before[z] = np.empty_like(above)
-            rows = np.zeros((k.SCRATCH_ROWS + 1, nx), above.dtype)
+            rows = np.empty((k.SCRATCH_ROWS, nx), above.dtype)
             k.z_reflection(
-                self.S[z - 1], above, first[z], self.axis_weights[z - 1], p, self.isotropic, rows,
-                np.empty((4, nx), above.dtype), before[z],
-            )  # fmt: skip
+                self.S[z - 1], above, first[z], self.axis_weights[z - 1], p, self.isotropic, rows, before[z]
+            )
         return first, before
 
     def _update(self) -> None:
