@@ -166,6 +166,9 @@ def _each_once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     return made
 
 
+_DIGITS = r"\d{301}"
+
+
 def parse_json(text: str | bytes, *, by_hand: bool = False) -> Any:
     """Return what JSON text says; raises ValueError for all that is none, nested without end or huge too.
 
@@ -175,6 +178,8 @@ def parse_json(text: str | bytes, *, by_hand: bool = False) -> Any:
         marks = text.count if isinstance(text, str) else lambda mark: text.count(mark.encode())
         if sum(map(marks, ",[{")) > _MOST_JSON_VALUES:
             raise ValueError(f"it has more than {_MOST_JSON_VALUES} values")
+    if re.search(_DIGITS, text) if isinstance(text, str) else re.search(_DIGITS.encode(), text):
+        raise ValueError("it has a number of more than 300 digits")
     try:
         return json.loads(text, object_pairs_hook=_each_once if by_hand else None)
     except RecursionError:

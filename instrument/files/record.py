@@ -305,3 +305,42 @@ def _dataclass_reader(kind: type) -> Reader:
         return kind(**values)
 
     return read
+
+
+def of_kind(value: Any, kind: Any, name: str = "") -> Any:
+    """Return part of a record without what is null of its parts, where it is of the kind that is expected.
+
+    A kind is a type, a tuple of which one is meant, ``[kind]`` for a list of such, or ``{name: kind}`` for an
+    object: what is named with a ``!`` has to be there, what is not named may be anything. Raises TypeError,
+    which names the part, where it is of another kind.
+    """
+    if isinstance(kind, tuple):
+        for one in kind[:-1]:
+            if isinstance(value, one):
+                return value
+        return of_kind(value, kind[-1], name)
+    if isinstance(kind, dict):
+        if not isinstance(value, Mapping):
+            raise TypeError(f"'{name}' is no object of names and values")
+        kinds = {key.rstrip("!"): one for key, one in kind.items()}
+        for key in kind:
+            if key.endswith("!") and value.get(key[:-1]) is None:
+                raise TypeError(f"'{name}' has no '{key[:-1]}'")
+        known = {key: part for key, part in value.items() if part is not None or key not in kinds}
+        return {
+            key: of_kind(part, kinds[key], f"{name}.{key}".strip(".")) if key in kinds else part
+            for key, part in known.items()
+        }
+    if isinstance(kind, list):
+        if not isinstance(value, list):
+            raise TypeError(f"'{name}' is no list")
+        return [of_kind(part, kind[0], name) for part in value]
+    is_flag = isinstance(value, bool) and kind is not object
+    if is_flag or not isinstance(value, (int, float) if kind is float else kind):
+        raise TypeError(f"'{name}' is {str(value)[:40]!r}, no {_WORDS[kind]}")
+    if kind is float and isinstance(value, int) and abs(value) > sys.float_info.max:
+        raise TypeError(f"'{name}' is a whole number of more than 300 digits")
+    return value
+
+
+_WORDS = {float: "number", int: "whole number", str: "text"}

@@ -11,19 +11,15 @@ import numpy as np
 
 from instrument.files.errors import FileError
 from instrument.files.record import value_of
-from instrument.reconstruction.job import prepared_record
+from instrument.reconstruction.job import MEASUREMENT, PSFS, prepared_record
 from instrument.reconstruction.options import InputOptions
 from instrument.reconstruction.request import PREPARED, PSF_STACK, READ_WITH, volume_job
 from instrument.reconstruction.stored_result import StoredResult
 from recon.base.declare import require, with_overrides
+from recon.base.marks import are_alike
 from recon.base.noise import NoiseModel
 from recon.reconstruction.measurement import Measurement
 from recon.types import Calibration
-
-NOT_CHECKED = (
-    "the volume's record, of a version before 2026-12, does not tell its PSFs and dark frame from others: "
-    "whether they have changed since was not checked."
-)
 
 
 class MadeOf(NamedTuple):
@@ -74,32 +70,50 @@ def made_of(result: StoredResult) -> MadeOf:
     image = _there(_named(told["image"].get("path"), told["image"]), result.path)
     psfs = _there(_named(told["calibration"], told.get(PSF_STACK)), result.path)
     job = volume_job(psfs, image, inputs)
-    if job.provenance["image"]["pixels_sha256"] != told["image"].get("pixels_sha256"):
+    pixels, then = told["image"].get("pixels_sha256"), told.get(PREPARED)
+    then, now = then if isinstance(then, Mapping) else {}, prepared_record(job)
+    alike = {
+        "photograph": pixels == job.provenance["image"]["pixels_sha256"] if isinstance(pixels, str) else None,
+        "PSFs": are_alike(then.get(PSFS), now[PSFS]),
+        "dark frame, background and mask": are_alike(then.get(MEASUREMENT), now[MEASUREMENT]),
+    }
+    if alike["photograph"] is False:
         raise FileError(
             image,
             f"is not the photograph any more that {result.path} was made of: its pixels differ.",
             "Put the photograph back, or reconstruct this one.",
         )
-    then, now = told.get(PREPARED), prepared_record(job)
-    measurement, calibration = job.as_measurement(inputs.noise), job.calibration
-    if _is_merged(result):
-        measurement, calibration = _in_grey(measurement, calibration)
-    if not isinstance(then, Mapping):
-        return MadeOf(measurement, calibration, NOT_CHECKED)
-    if then.get("psfs_sha256") != now["psfs_sha256"]:
+    if alike["PSFs"] is False:
         raise FileError(
             psfs,
             f"holds other PSFs than those that {result.path} was made of.",
             "Put those back, or reconstruct the volume again.",
         )
-    if then.get("measurement_sha256") != now["measurement_sha256"]:
+    if alike["dark frame, background and mask"] is False:
+        cause = "its dark frame, the calibration's background or the mask of --erasures has changed since"
+        if alike["photograph"] is None:
+            cause += ", or it is another photograph"
         raise FileError(
             result.path,
-            "was made of the same photograph, but not of what is left of it now: its dark frame, the "
-            "calibration's background or the mask of --erasures has changed since.",
+            f"was made of other numbers than what is left of its photograph now: {cause}.",
             "Put back what changed, or reconstruct the volume again.",
         )
-    return MadeOf(measurement, calibration, "")
+    measurement, calibration = job.as_measurement(inputs.noise), job.calibration
+    if _is_merged(result):
+        measurement, calibration = _in_grey(measurement, calibration)
+    return MadeOf(
+        measurement, calibration, _not_checked([what for what, known in alike.items() if known is None])
+    )
+
+
+def _not_checked(what: list[str]) -> str:
+    """Say what of a volume's inputs its record does not tell from others; nothing where it tells all."""
+    if not what:
+        return ""
+    return (
+        f"the volume's record does not tell its {', '.join(what)} from others, as one of a version before "
+        "2026-12: whether they have changed since was not checked."
+    )
 
 
 def _in_grey(measurement: Measurement, calibration: Calibration) -> tuple[Measurement, Calibration]:

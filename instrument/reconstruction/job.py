@@ -42,10 +42,14 @@ from instrument.reconstruction.preparation import (
     saturated_pixels,
 )
 from instrument.reconstruction.straightened import require_no_counts, straightened, straightened_dark
+from recon.base.marks import Marks, marks_of
 from recon.base.noise import NoiseModel, averaged_noise
 from recon.camera.factors import Pattern
 from recon.reconstruction.measurement import Measurement
 from recon.types import Calibration
+
+MEASUREMENT, PSFS = "measurement_marks", "psfs_marks"
+"""What a record calls the marks of the prepared photograph, and of its PSFs with their places."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -477,23 +481,13 @@ def source_record(file: ImageFile) -> dict[str, Any]:
     return told | ({"array": file.array} if file.array else {}) | ({"taken": taken} if taken else {})
 
 
-def prepared_record(job: Job) -> dict[str, str]:
+def prepared_record(job: Job) -> dict[str, list[Marks]]:
     """Return what tells a job's measurement, and its PSFs with their places, from others."""
     calibration, geometry = job.calibration, job.calibration.geometry
     lengths = np.array([geometry.pixel_pitch_um, geometry.diffuser_distance_mm], np.float64)
-    return {
-        "measurement_sha256": _digest(job.measurement, *(() if job.valid is None else (job.valid,))),
-        "psfs_sha256": _digest(calibration.psfs, calibration.source_positions_um, lengths),
-    }
-
-
-def _digest(*arrays: npt.NDArray[Any]) -> str:
-    """Return a checksum of arrays and their shapes."""
-    digest = hashlib.sha256()
-    for array in arrays:
-        digest.update(f"{array.dtype} {array.shape};".encode())
-        digest.update(np.ascontiguousarray(array).data)
-    return digest.hexdigest()
+    measured = (job.measurement, *(() if job.valid is None else (job.valid,)))
+    of_psfs = (calibration.psfs, calibration.source_positions_um, lengths)
+    return {MEASUREMENT: [marks_of(one) for one in measured], PSFS: [marks_of(one) for one in of_psfs]}
 
 
 def dark_record(dark: Dark) -> dict[str, Any]:

@@ -21,6 +21,7 @@ from instrument.files.images import read_image, write_image
 from instrument.files.ome_zarr import is_zarr_name, stem_of
 from instrument.files.orientation import AS_IT_IS, Orientation
 from instrument.files.reading import parse_json, read_bytes, require_file
+from instrument.files.record import of_kind
 from instrument.files.seen import as_seen
 from instrument.files.tiff_pages import open_tiff
 from instrument.reconstruction.job import find_calibration
@@ -33,6 +34,31 @@ from recon.errors import InputError
 from recon.reconstruction.psf_refinement import as_refined
 from recon.solvers.base import IterationRecord
 from recon.verdict.judge import Region
+
+_HISTORY = [{"iteration!": float, "seconds!": float}]
+_TOLD: dict[str, Any] = {
+    "inputs": {
+        "image": (str, {"path!": str, "taken": {"exposure_ms": (float, str)}}),
+        "psf": (str, {"path!": str}),
+        "calibration": str,
+        "dark": {},
+    },
+    "provenance": {
+        "psf_refinement": {},
+        "auto": {"decisions": [{"name!": object, "value!": object, "why!": object}]},
+    },
+    "verdict": {"sentences": [object]},
+    "uncertainty": {"sentences": [object]},
+    "warnings": [object],
+    "history": _HISTORY,
+    "histories": [_HISTORY],
+    "stop_reasons": [object],
+    "noise_norm": float,
+    "tau": float,
+    "seconds": float,
+    "grid": {"shape": [int], "object_pitch_um": float, "pixel_mrad": float},
+}
+"""What is read of a record: a type, or what an object or a list holds, or one of several; ! is needed."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -277,7 +303,7 @@ def open_result(path: Path | str) -> StoredResult:
     Raises FileError when it is none, or its record is damaged.
     """
     path = _data_file(Path(path))
-    record = _record_of(path)
+    record = _read_record(record_file(path))
     if is_zarr_name(path) or path.is_dir() or _is_volume(path, record):
         return StoredResult(path, None, open_volume(path), record)
     pixels = read_image(path).pixels
@@ -317,16 +343,29 @@ def _data_file(path: Path) -> Path:
     return path
 
 
-def _record_of(path: Path) -> dict[str, Any]:
-    beside = record_file(path)
-    if not beside.is_file():
+def _read_record(path: Path) -> dict[str, Any]:
+    """Return a record as it was written, without what is null of what is read; empty where there is none.
+
+    Raises FileError where it is damaged, with the name of the part that is of another kind.
+    """
+    if not path.is_file():
         return {}
     try:
-        record = parse_json(read_bytes(beside))
+        record = parse_json(read_bytes(path))
     except (OSError, ValueError) as error:
-        raise FileError(beside, f"cannot be read as JSON: {error}.") from error
+        raise FileError(path, f"cannot be read as JSON: {error}.") from error
     # Another program's JSON, or that of another kind of file of ours, is no record of this one.
-    return record if isinstance(record, dict) and isinstance(record.get("grid"), dict) else {}
+    if not isinstance(record, dict) or not isinstance(record.get("grid"), dict):
+        return {}
+    try:
+        told: dict[str, Any] = of_kind(record, _TOLD)
+    except TypeError as error:
+        raise FileError(
+            path,
+            f"is damaged: {error}.",
+            "Reconstruct again, or move it away: the image alone is kept then.",
+        ) from None
+    return told
 
 
 def _is_volume(path: Path, record: Mapping[str, Any]) -> bool:

@@ -11,6 +11,8 @@ import numpy.typing as npt
 if TYPE_CHECKING:
     from recon.camera.grid import Grid
 
+_BEYOND = 1e18
+"""Micrometres, or pixels: so far off lies nothing, and squares of it are still numbers."""
 EVEN = 0.01
 """Steps that differ by less than this part of the smallest are taken for even."""
 
@@ -97,7 +99,7 @@ def grid_of(facts: Mapping[str, Any], shape: tuple[int, int, int]) -> Grid:
 
     n_z, *size = shape
     z_um, pitch_um = (numbers(facts.get(name), (n_z,)) for name in ("z_um", "pitch_um"))
-    if z_um is None or pitch_um is None:
+    if z_um is None or pitch_um is None or (pitch_um <= 0).any():
         z_um = pitch_um = np.full(n_z, np.nan)
     centre = numbers(facts.get("centre"), (2,))
     row, column = (n // 2 for n in size) if centre is None else centre.astype(int).tolist()
@@ -108,12 +110,12 @@ def grid_of(facts: Mapping[str, Any], shape: tuple[int, int, int]) -> Grid:
 
 
 def numbers(value: Any, shape: tuple[int, ...]) -> npt.NDArray[np.float64] | None:
-    """Return finite numbers of a shape, () for one; None where a record has something else."""
+    """Return numbers of a shape, () for one; None where a record has something else, or what is no size."""
     try:
         numbers = np.array(value, np.float64)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         return None
-    return numbers if numbers.shape == shape and np.isfinite(numbers).all() else None
+    return numbers if numbers.shape == shape and (np.abs(numbers) < _BEYOND).all() else None
 
 
 def known(values: npt.NDArray[np.float64]) -> list[float] | None:

@@ -1,7 +1,8 @@
 """Feed damaged files to the readers: ``python -m tests.fuzz READER --seconds N`` (or ``all`` of them).
 
 Every input is the sound file, or one that broke something before, with bytes flipped, cut, repeated, moved,
-or replaced by what is hard to read: brackets without end, huge numbers, NaN, zeros. A reader passes when it
+or replaced by what is hard to read: brackets without end, huge numbers, NaN, zeros. Of JSON half are sound as
+text, with a value that is another, of another kind, or gone. A reader passes when it
 returns, or raises a known mistake in words, within two seconds and 500 MB. What fails is kept in
 ``tests/fuzz/corpus/READER`` (with ``--keep``) and is read again by tests/fuzz/test_readers.py.
 """
@@ -9,7 +10,9 @@ returns, or raises a known mistake in words, within two seconds and 500 MB. What
 from __future__ import annotations
 
 import argparse
+import copy
 import hashlib
+import json
 import logging
 import random
 import resource
@@ -21,6 +24,7 @@ import warnings
 from collections.abc import Iterator
 from pathlib import Path
 from types import FrameType
+from typing import Any
 
 from instrument.files.errors import in_words
 from tests.fuzz.readers import READERS, Reader
@@ -39,8 +43,16 @@ class TooSlowError(BaseException):
     """A reader takes longer than it may; no ``except Exception`` hides it."""
 
 
+VALUES = (
+    None, True, False, 0, -1, 1, 2, 0.5, 1e308, -1e308, float("nan"), float("inf"), 10**20, 10**400, "",
+    "a", "nan", "../..", "\0", [], [0], [None], ["a"], [[1.0]], {}, {"a": 1}, {"path": 3},
+)  # fmt: skip
+
+
 def mutated(data: bytes, rng: random.Random) -> bytes:
     """Return damaged bytes."""
+    if data[:1] == b"{" and rng.random() < 0.5 and (text := _of_another_kind(data, rng)):
+        return text
     changed = bytearray(data)
     for _ in range(rng.choice((1, 1, 1, 2, 4, 16))):
         place = rng.randrange(len(changed) + 1)
@@ -65,6 +77,32 @@ def mutated(data: bytes, rng: random.Random) -> bytes:
             case _:
                 _replace_number(changed, rng)
     return bytes(changed)
+
+
+def _of_another_kind(data: bytes, rng: random.Random) -> bytes:
+    """Return JSON, or a line of it, with one to three values put in others' places or left out."""
+    lines = data.splitlines() if data.count(b"\n{") else [data]
+    line = rng.randrange(len(lines))
+    try:
+        whole = [json.loads(lines[line])]
+    except ValueError:
+        return b""
+    for _ in range(rng.choice((1, 1, 1, 2, 3))):
+        places: list[tuple[Any, Any]] = []
+        left: list[Any] = [whole]
+        while left:
+            inside = left.pop()
+            keys = list(inside) if isinstance(inside, dict) else range(len(inside))
+            places += [(inside, key) for key in keys]
+            left += [inside[key] for key in keys if isinstance(inside[key], dict | list)]
+        inside, key = rng.choice(places)
+        other = rng.choice(places)
+        if rng.random() < 0.1 and inside is not whole:
+            del inside[key]
+        else:
+            inside[key] = copy.deepcopy(rng.choice((*VALUES, other[0][other[1]])))
+    lines[line] = json.dumps(whole[0]).encode()
+    return b"\n".join(lines)
 
 
 def _replace_number(data: bytearray, rng: random.Random) -> None:

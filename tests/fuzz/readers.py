@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import shutil
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -16,15 +17,22 @@ from instrument.bench.config_file import load_config, template
 from instrument.display.hologram import load_alignment
 from instrument.files.calibration_file import calibrated_depths_um, load_calibration, save_calibration
 from instrument.files.images import read_image, read_stack
+from instrument.files.record import plain
 from instrument.files.slm_image import load_slm_correction
 from instrument.files.stability_file import read_stability
 from instrument.plan.model import load_plan
+from instrument.reconstruction.again import can_be_fitted, made_of
 from instrument.reconstruction.film import Film
-from instrument.reconstruction.stored_result import open_result
+from instrument.reconstruction.options import InputOptions
+from instrument.reconstruction.request import VolumeRequest
+from instrument.reconstruction.stored_result import StoredResult, open_result
 from instrument.reconstruction.video_files import VideoPictures, create_output
 from instrument.runs.inspection import verify
 from instrument.runs.run import Run
+from instrument.volumes.grid_facts import grid_facts
 from instrument.volumes.opening import open_volume
+from recon.analysis.point_places import PointOptions, point_places
+from recon.camera.grid import Grid
 from recon.types import Calibration
 
 FIXTURES = Path(__file__).parents[1] / "fixtures" / "v813d646"
@@ -115,6 +123,40 @@ def _calibration(folder: Path) -> Path:
     return save_calibration(made, folder / "calibration")
 
 
+def _volume_made(folder: Path) -> Path:
+    """A volume with its record, and the photograph and PSFs that it was made of."""
+    calibration = _calibration(folder)
+    cv2.imwrite(str(folder / "photo.png"), np.pad(_pixels(), ((0, 0), (0, 4))))
+    cv2.imwrite(str(folder / "dark.png"), np.full((12, 20), 7, np.uint16))
+    inputs = InputOptions(dark=folder / "dark.png", noise=1.0)
+    request = VolumeRequest(image=folder / "photo.png", psfs=calibration, inputs=inputs)
+    told = request.prepare().provenance
+    grid = Grid((2, 12, 20), (6, 10), np.array([1e5, 2e5]), np.array([10.0, 20.0]))
+    np.save(folder / "volume.npy", np.random.default_rng(1).random(grid.shape, np.float32))
+    record = {"model": "convolution", "inputs": told, "grid": grid_facts(grid)}
+    (folder / "volume.json").write_text(json.dumps(plain(record)))
+    return folder / "volume.npy"
+
+
+def _shown(path: Path) -> StoredResult:
+    """Open a result and ask it for all that is shown of it."""
+    result = open_result(path)
+    for name, kind in vars(StoredResult).items():
+        if isinstance(kind, property):
+            getattr(result, name)
+    result.facts()
+    repr(result)
+    can_be_fitted(result)
+    return result
+
+
+def _made_of(path: Path) -> None:
+    result = _shown(path)
+    if result.grid is not None and result.volume is not None:
+        point_places(result.volume.plane, result.grid, PointOptions())
+    made_of(result)
+
+
 def _video(folder: Path) -> Path:
     folder.mkdir(exist_ok=True)
     path = folder / "film.ome.zarr"
@@ -170,7 +212,8 @@ READERS: dict[str, Reader] = {
     "hdf5": Reader(_hdf5, _image_and_stack),
     "matlab": Reader(_matlab, _image_and_stack),
     "side-car": Reader(_png, lambda path: read_image(path), ("../a.json",)),
-    "result": Reader(_result, lambda path: open_result(path / "picture.tif"), ("picture.json",)),
+    "result": Reader(_result, lambda path: _shown(path / "picture.tif"), ("picture.json",)),
+    "volume-record": Reader(_volume_made, _made_of, ("../volume.json",)),
     "run": Reader(
         _copied("run"),
         lambda path: verify(Run.open(path)),

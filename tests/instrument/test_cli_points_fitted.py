@@ -120,10 +120,23 @@ def test_what_a_volume_was_made_of_is_found_again_and_refused_where_it_has_chang
     dark = tifffile.imread(data / "dark.tif")
     tifffile.imwrite(data / "dark.tif", dark + 7)
     assert "its dark frame, the calibration's background or the mask" in said(2)
-    record = json.loads((moved.parent / "w.json").read_text())
+    beside = moved.parent / "w.json"
+    record = json.loads(beside.read_text())
+    del record["inputs"]["image"]["pixels_sha256"]
+    beside.write_text(json.dumps(record))
+    assert "mask of --erasures has changed since, or it is another photograph" in said(2)
+    tifffile.imwrite(data / "dark.tif", dark)
+    words = said(0)
+    assert "does not tell its photograph from others" in words
+    assert "pixels differ" not in words
+    told = record["inputs"]["prepared"]
+    for name in ("psfs_marks", "measurement_marks"):  # as another processor rounds
+        told[name][0]["marks"] = [value * (1 + 1e-7) + 1e-7 for value in told[name][0]["marks"]]
+    beside.write_text(json.dumps(record))
+    assert "fitted to the photograph" in said(0)
     del record["inputs"]["prepared"]
-    (moved.parent / "w.json").write_text(json.dumps(record))
-    assert "whether they have changed since was not checked" in said(0)
+    beside.write_text(json.dumps(record))
+    assert "its photograph, PSFs, dark frame, background and mask from others" in said(0)
     (moved.parent / "two.npz").unlink()
     words = said(2)
     assert "two.npz: there is no such file any more" in words
@@ -140,7 +153,7 @@ def test_what_a_volume_was_made_of_is_found_again_and_refused_where_it_has_chang
         (("options", "sharpness"), 5, "sharpness is not known"),
         (("options", "erasures"), "none.tif", "none.tif: there is no such file"),
         (("options",), [1], "does not tell of which photograph"),
-        ((), [1], "does not tell of which photograph"),
+        ((), [1], "is damaged: 'inputs' is no object"),
     ],
 )
 def test_a_damaged_record_is_refused_in_words(

@@ -1,0 +1,101 @@
+"""Records beside results whose parts are of another kind, and marks of what they were made of."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from instrument.files.errors import FileError
+from instrument.files.reading import parse_json
+from instrument.reconstruction.stored_result import open_result
+from instrument.volumes.grid_facts import grid_of
+from recon.base.marks import are_alike, marks_of
+
+RESULTS = Path(__file__).parents[1] / "fixtures" / "v813d646" / "results"
+RNG = np.random.default_rng(4)
+
+
+@pytest.mark.parametrize(
+    ("place", "value", "words"),
+    [
+        (("provenance",), [], "'provenance' is no object"),
+        (("provenance", "auto"), "a", "'provenance.auto' is no object"),
+        (("provenance", "auto", "decisions"), [{"value": 1}], "'provenance.auto.decisions' has no 'name'"),
+        (("history",), [{"iteration": 1}], "'history' has no 'seconds'"),
+        (("history",), [None], "'history' is no object"),
+        (("verdict", "sentences"), "good", "'verdict.sentences' is no list"),
+        (("warnings",), 3, "'warnings' is no list"),
+        (("inputs", "image"), {"pixels": "a"}, "'inputs.image' has no 'path'"),
+        (("inputs", "image"), 3, "'inputs.image' is no object"),
+        (("tau",), "small", "'tau' is 'small', no number"),
+        (("seconds",), True, "'seconds' is 'True', no number"),
+        (("grid", "shape"), ["a"], "'grid.shape' is 'a', no whole number"),
+        (("tau",), 10**400, "more than 300 digits"),
+    ],
+)
+def test_what_is_of_another_kind_is_named(
+    place: tuple[str, ...], value: object, words: str, tmp_path: Path
+) -> None:
+    for end in ("json", "tif"):
+        shutil.copyfile(RESULTS / f"picture.{end}", tmp_path / f"picture.{end}")
+    record = json.loads((tmp_path / "picture.json").read_text())
+    inside: Any = record
+    for name in place[:-1]:
+        inside = inside[name]
+    for put, says in ((value, words), (None, "")):
+        inside[place[-1]] = put
+        (tmp_path / "picture.json").write_text(json.dumps(record))
+        if says:
+            with pytest.raises(FileError, match=r"picture\.json") as caught:
+                open_result(tmp_path / "picture.tif")
+            assert says in str(caught.value)
+        else:  # null is what is not known
+            assert dict(open_result(tmp_path / "picture.tif").facts())["Size"]
+
+
+def test_numbers_that_are_no_sizes_are_not_known() -> None:
+    facts = {"z_um": [1e4, 2e4], "pitch_um": [10.0, 20.0], "centre": [1, 2]}
+    assert grid_of(facts, (2, 3, 4)).pitch_um.tolist() == [10.0, 20.0]
+    for wrong in ([0.0, 20.0], [-1.0, 20.0], [1e300, 1.0], [10**400, 1.0]):
+        assert np.isnan(grid_of({**facts, "pitch_um": wrong}, (2, 3, 4)).z_um).all()
+    assert grid_of({**facts, "centre": [1e300, 0]}, (2, 3, 4)).centre == (1, 2)
+    assert parse_json("9" * 300)
+    for text in ("9" * 301, b"[1" + b"0" * 301 + b"]"):
+        with pytest.raises(ValueError, match="more than 300 digits"):
+            parse_json(text)
+
+
+def test_marks_are_the_same_but_for_rounding_and_no_others() -> None:
+    array = RNG.gamma(1.0, 100.0, (3, 170, 260)).astype(np.float32)  # of more than one piece
+    marks = marks_of(array)
+    told = json.loads(json.dumps(marks))
+    assert are_alike([told], [marks_of(array * (1 + 3e-7 * RNG.standard_normal(array.shape)))])
+    one = array.copy()
+    one[1, 80, 100] += 0.01 * np.linalg.norm(array)
+    swapped = array.reshape(-1).copy()
+    swapped[[5, 70_000]] = 0.0, 9000.0
+    moved = array.reshape(-1).copy()
+    moved[[5, 70_000]] = 9000.0, 0.0
+    assert are_alike([marks_of(swapped)], [marks_of(moved)]) is False
+    others = (one, np.roll(array, 1, 2), np.roll(array, 1, 0), array[::-1], array + 1, 1.001 * array, array.T)
+    for other in (*others, array[:, :, :-1], np.concatenate([array, 0 * array[:1]])):
+        assert are_alike([told], [marks_of(np.asarray(other))]) is False
+    assert are_alike([told, told], [marks]) is False
+    kept = np.array([[True, False, True]])
+    assert are_alike([marks_of(kept)], [marks_of(kept)])
+    assert are_alike([marks_of(kept)], [marks_of(~kept)]) is False
+    assert are_alike([marks_of(np.zeros(3))], [marks_of(np.zeros(3))])
+    for wrong in (None, 3, [], [3], [{**told, "marks": None}], [{**told, "norm": ["a"]}]):
+        assert are_alike(wrong, [marks]) is None
+    for wrong in (
+        [{**told, "marks": [float("nan")]}],
+        [{**told, "shape": [10**400]}],
+        [{**told, "norm": 1.0}],
+    ):
+        assert are_alike(wrong, [marks]) is None
+    assert are_alike([{**told, "marks": [0.0]}], [marks]) is False
