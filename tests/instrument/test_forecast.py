@@ -7,6 +7,7 @@ import time
 from dataclasses import replace
 from pathlib import Path
 
+import numba
 import numpy as np
 import pytest
 from numba.core import event
@@ -108,6 +109,20 @@ def test_what_a_program_reads_once_is_no_part_of_it(monkeypatch: pytest.MonkeyPa
     told = carried_out(lambda n, s, done: replace(begin(n, s, done), cut=n is None), 5.0)
     assert (len(tried), told.seconds) == (5, 1.8), "its first iterations are carried out anew as ever"
     assert told.memory_bytes == pytest.approx(1e8 / 5)
+
+
+def test_a_kernel_that_is_compiled_is_no_part_of_it_though_its_module_was_read_before() -> None:
+    kernel = numba.njit(lambda x: 2 * x)
+    tried = list[float]()
+
+    def begin(_iterations: int | None, _time_s: float, done: float) -> Carried:
+        tried.append(done)
+        assert kernel(len(tried)) == 2 * len(tried)
+        return Carried(9.0 / len(tried), 0.0, [[]], cut=False)
+
+    assert carried_out(begin, 5.0).seconds == 4.5
+    assert carried_out(begin, 5.0).seconds == 3.0
+    assert tried == [0.0, 0.5, 0.0], "it is there by now"
 
 
 def test_held_out_pixels_take_a_third_of_the_iterations_more(scene: tuple[Measurement, Calibration]) -> None:
