@@ -10,7 +10,9 @@ from drivers.frame import Frame
 from gui.session import BenchSession
 from gui.session_news import OwnFiles, names_of
 from instrument.bench.config import BenchConfig
-from instrument.bench.photograph import SPOILT
+from instrument.bench.lit import LightState
+from instrument.bench.lit import light_of as lit_now
+from instrument.bench.photograph import spoilt
 from instrument.bench.photograph_file import PHOTOGRAPHS
 from instrument.files.atomic import DOUBTFUL
 from instrument.files.calibration_file import newest_calibration
@@ -122,12 +124,12 @@ def _newest(folder: Path, *patterns: str) -> Path | None:
     return max(found)[1] if found else None
 
 
-def light_of(frame: Frame | None) -> str:
-    """Return how bright a frame is: ``"unknown"``, ``"dark"``, ``"saturated"`` or ``"good"``."""
+def light_of(frame: Frame | None, lit: LightState = LightState.AS_IS) -> str:
+    """Return how bright a frame in a light is: ``"unknown"``, ``"dark"``, ``"saturated"`` or ``"good"``."""
     if frame is None:
         return "unknown"
     metadata = frame.metadata
-    if metadata.saturated_fraction > SPOILT:
+    if spoilt(metadata.saturated_fraction, lit):
         return "saturated"
     brightest = int(frame.image[::_STRIDE, ::_STRIDE].max())
     return "dark" if brightest < _DARK * ((1 << metadata.significant_bits) - 1) else "good"
@@ -136,7 +138,7 @@ def light_of(frame: Frame | None) -> str:
 def _light_now(session: BenchSession) -> str:
     newest = session.live.newest()
     is_held = newest is None and not session.live.is_running and not session.viewing.wanted
-    return "held" if is_held else light_of(newest)
+    return "held" if is_held else light_of(newest, lit_now(session.bench))
 
 
 def facts_of(session: BenchSession, made: Made) -> Facts:

@@ -11,7 +11,7 @@ import typer
 
 from instrument.bench.bench import Bench
 from instrument.bench.lit import LightState, switch_light
-from instrument.bench.photograph import SPOILT, Snapshot
+from instrument.bench.photograph import Snapshot, spoilt
 from instrument.bench.photograph_file import check_photograph_file, photograph_name, write_snapshot
 from instrument.cli.app import (
     App,
@@ -208,7 +208,8 @@ def _report(target: Path, taken: Snapshot, light: LightState) -> None:
         f"{metadata.exposure_ms:g} ms, gain {metadata.gain:g}, {frames}."
     )
     saturated = metadata.saturated_fraction
-    few = f"; {percent(saturated)} of the pixels are saturated" if 0 < saturated <= SPOILT else ""
+    too_many = spoilt(saturated, light)
+    few = f"; {percent(saturated)} of the pixels are saturated" if saturated and not too_many else ""
     typer.echo(
         f"Counts {float(taken.image.min()):g} to {float(taken.image.max()):g}, "
         f"mean {float(np.mean(taken.image, dtype=np.float64)):.1f}, of {taken.full_scale}{few}."
@@ -224,9 +225,13 @@ def _report(target: Path, taken: Snapshot, light: LightState) -> None:
             f"Note: the brightest pixel is below {DIM:.0%} of full scale; lengthen --exposure-ms.",
             err=True,
         )
-    if saturated > SPOILT:
-        words = f"{percent(saturated)} of the pixels are saturated; shorten --exposure-ms."
+    if too_many:
+        words = f"{percent(saturated)} of the pixels are saturated{_none_may(light)}; shorten --exposure-ms."
         typer.echo(f"Warning: {words}", err=True)
+
+
+def _none_may(light: LightState) -> str:
+    return ", of a PSF none may be" if light is LightState.SOURCE else ""
 
 
 @record_app.command(
@@ -256,7 +261,7 @@ def record(
             )
             with keys({"q": recorder.stop}):
                 run = recorder.execute()
-    _last_words(run)
+    _last_words(run, light)
     files.draw(run)
 
 
@@ -273,7 +278,7 @@ def _note(status: RecordingStatus) -> str:
     return "  ".join(words)
 
 
-def _last_words(run: Run) -> None:
+def _last_words(run: Run, light: LightState) -> None:
     mark = " SIMULATED" if run.is_simulated else ""
     by_device = sum(gap.by_device for gap in run.gaps)
     not_written = sum(gap.not_written for gap in run.gaps)
@@ -288,8 +293,8 @@ def _last_words(run: Run) -> None:
     if saturated := [f for r in run.records.values() if (f := r.metadata.saturated_fraction) > 0]:
         most = percent(max(saturated))
         words = f"{len(saturated)} of {len(run.records)} frames have saturated pixels, up to {most} of them"
-        if max(saturated) > SPOILT:
-            typer.echo(f"Warning: {words}; shorten --exposure-ms.", err=True)
+        if spoilt(max(saturated), light):
+            typer.echo(f"Warning: {words}{_none_may(light)}; shorten --exposure-ms.", err=True)
         else:
             typer.echo(f"{words}.")
     typer.echo(f"Run: {run.path}")

@@ -268,6 +268,26 @@ def test_a_pixel_at_full_scale_is_told_and_no_warning(
     assert "Warning" not in told
 
 
+def test_a_point_source_is_warned_of_before_a_scene(
+    here: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (here / "sim.toml").write_text(
+        '[camera]\ndriver = "simulated"\n[scene]\ncontrol = "simulated"\n'
+        '[simulated]\npreset = "tiny"\ntime_scale = 0\n'
+    )
+    true = SimulatedCamera._read_out
+    monkeypatch.setattr(SimulatedCamera, "_read_out", lambda *given: (true(*given)[0], 2e-5))
+    words = ["--as-is", "--bench", str(here / "sim.toml"), "--exposure-ms", "1"]
+    for light, warned in (("--source", True), ("--scene", False)):
+        assert main(["snap", *words, light, "--out", str(here / f"photo{light}.tif")]) == 0
+        told = capsys.readouterr()
+        assert ("Warning: 0.002 % of the pixels are saturated, of a PSF none may be;" in told.err) is warned
+        assert ("; 0.002 % of the pixels are saturated." in told.out) is not warned
+        assert main(["record", light, "--frames", "2", *words]) == 0
+        told = capsys.readouterr()
+        assert ("up to 0.002 % of them, of a PSF none may be; shorten" in told.err) is warned
+
+
 def test_one_program_at_a_time_writes_to_a_run(here: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["run", "plan.toml"]) == 0
     run = the_run(here)
