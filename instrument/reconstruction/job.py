@@ -22,6 +22,7 @@ from instrument.reconstruction.mosaic import (
     mosaic_psf,
     on_every_pixel,
     pattern_of,
+    require_whole_cells,
     suspected_mosaic,
 )
 from instrument.reconstruction.options import InputOptions, NoiseChoice
@@ -138,7 +139,7 @@ def job_from_files(psf_file: Path | ImageFile, image_file: Path | ImageFile, inp
         other = "PSFs of several depths in a folder are given by --volume, a calibration by --calibration."
         raise FileError(psf_file, "is a folder; a file is expected.", other)
     raw_psf = read_image(psf_file, several="PSFs, one a depth, are given together by --volume.")
-    image = read_image(image_file, holes=True)
+    image = read_image(image_file, holes=True, several=OF_A_FILM)
     crop, binning = inputs.crop, inputs.binning
     _refuse_constant(image)
     pattern = pattern_of(inputs.mosaic, image)
@@ -220,20 +221,30 @@ def job_from_calibration(folder: Path, image: Path | ImageFile, inputs: InputOpt
 
 
 def job_with(
-    calibration: Calibration, folder: Path, image_file: Path | ImageFile, inputs: InputOptions
+    calibration: Calibration,
+    folder: Path,
+    image_file: Path | ImageFile,
+    inputs: InputOptions,
+    *,
+    straight: bool = False,
 ) -> Job:
-    """Prepare an image for a calibration that came from ``folder``; as :func:`job_from_calibration`."""
-    image = read_image(image_file, holes=True)
+    """Prepare an image for a calibration that came from ``folder``; as :func:`job_from_calibration`.
+
+    ``straight``: its PSFs were files, and were straightened where that is asked for.
+    """
+    image = read_image(image_file, holes=True, several=OF_A_FILM)
     crop = inputs.crop
     _refuse_constant(image)
-    if inputs.srgb in ("psf", "both"):
+    if inputs.srgb in ("psf", "both") and not straight:
         raise FileError(folder, "a calibration's PSFs are in proportion to the light.", "--srgb photograph.")
     require_no_counts(inputs.noise, inputs.srgb)
     dark, read = straightened_dark(inputs.dark, image, inputs.srgb), image
-    image = straightened(image) if inputs.srgb == "photograph" else image
+    image = straightened(image) if inputs.srgb in ("photograph", "both") else image
     shape = calibration.psfs.shape[-2:]
     match = matching_binning(image, shape, folder)
     pattern = pattern_of(inputs.mosaic, image)
+    if pattern is not None:
+        require_whole_cells(image, match)
     calibration, grey = matched_calibration(calibration, image, mosaic=pattern is not None)
     level = calibrated_dark(dark, image, calibration, match)
     factor = inputs.binning or 1
@@ -248,7 +259,7 @@ def job_with(
         reduced_calibration(calibration, crop, factor),
         {
             "Calibration": f"{folder}: {len(calibration.psfs)} PSFs of {shape[0]} x {shape[1]}",
-            "Image": describe(read) + (f", binned {match} x {match} to the calibration" if match > 1 else ""),
+            "Image": describe(read) + binned_note(match),
             "Dark": level.reason,
             "Pixels": describe_window(crop, factor, factor, measurement),
             "Erased": erased.reason,
@@ -275,6 +286,10 @@ def job_with(
     )
 
 
+OF_A_FILM = (
+    "Frames of a film become a recording by diffuserbench import FILE, and it a video by diffuserbench "
+    "reconstruct RUN --video."
+)
 _PLAIN_PSFS = (
     "PSF images by themselves tell no places: reconstruct takes one by --psf FILE, one a depth by "
     "--volume FOLDER."
@@ -450,6 +465,11 @@ def mosaic_note(pattern: Pattern | None) -> dict[str, str]:
     if pattern is None:
         return {}
     return {"Mosaic": f"{pattern}: every pixel counts for its own colour, nothing is demosaiced"}
+
+
+def binned_note(match: int) -> str:
+    """Tell of a photograph's, or a film's, pixels that became a calibration's; empty where they are its."""
+    return f", binned {match} x {match} to the calibration" if match > 1 else ""
 
 
 def mended_note(count: int) -> tuple[str, ...]:

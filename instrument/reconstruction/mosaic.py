@@ -96,6 +96,20 @@ def require_mosaic(image: ImageFile, pattern: Pattern) -> None:
         )
 
 
+def require_whole_cells(image: ImageFile, match: int) -> None:
+    """Refuse a raw frame of whose pixels an odd number, along each side, makes one of its calibration's.
+
+    Raises FileError.
+    """
+    if match > 1 and match % 2:
+        raise FileError(
+            image.path,
+            f"is a colour mosaic's raw frame, and {match} x {match} of its pixels make one of the "
+            "calibration's: colours are averaged over whole cells of 2 x 2.",
+            "Photograph with the calibration's binning, or take the frame as grey (--bayer none).",
+        )
+
+
 def reduce_mosaic(
     raw: FloatImage, pattern: Pattern, crop: Crop | None, binning: int
 ) -> tuple[FloatImage, npt.NDArray[np.bool_]]:

@@ -17,6 +17,7 @@ from instrument.files.images import ImageFile, read_image, read_stack
 from instrument.reconstruction.defects import mended_stack
 from instrument.reconstruction.forecast import Forecast, forecast
 from instrument.reconstruction.job import (
+    OF_A_FILM,
     Job,
     job_from_calibration,
     job_from_files,
@@ -27,6 +28,7 @@ from instrument.reconstruction.job import (
 from instrument.reconstruction.mosaic import pattern_of
 from instrument.reconstruction.options import InputOptions, SourceOptions
 from instrument.reconstruction.preparation import darkest_block
+from instrument.reconstruction.straightened import straightened
 from instrument.runs.run_files import STATE
 from instrument.volumes.grid_facts import numbers
 from recon.base.checks import require_noise, select_psf
@@ -240,7 +242,9 @@ def volume_job(psfs: Path | ImageFile, image: Path | ImageFile, inputs: InputOpt
             return job_from_calibration(psfs, image, inputs)
         own = image.path if isinstance(image, ImageFile) else image
         psfs = read_stack(psfs, leave_out=own)
-    image = read_image(image, holes=True)
+    if coded := inputs.srgb in ("psf", "both"):
+        psfs = straightened(psfs)
+    image = read_image(image, holes=True, several=OF_A_FILM)
     mends = pattern_of(inputs.mosaic, image) is None and inputs.erasures != "none"
     stack, n_mended = mended_stack(psfs.pixels) if mends else (psfs.pixels, 0)
     pixels = stack.astype(np.float32)
@@ -262,7 +266,7 @@ def volume_job(psfs: Path | ImageFile, image: Path | ImageFile, inputs: InputOpt
         geometry=Geometry(pitch_um, inputs.distance_mm),
         provenance={"psfs": str(psfs.path), "simulated": psfs.is_simulated},
     )
-    job = job_with(calibration, psfs.path, image, inputs)
+    job = job_with(calibration, psfs.path, image, inputs, straight=coded)
     words = "; ".join(filter(None, (*psfs.notes, said, *mended_note(n_mended))))
     return replace(
         job,

@@ -20,7 +20,7 @@ from instrument.files.films import as_shown, write_mp4
 from instrument.files.images import ImageFile
 from instrument.files.ome_zarr import is_zarr_name, stem_of
 from instrument.files.record import plain
-from instrument.reconstruction.job import Job, Reduction
+from instrument.reconstruction.job import Job, Reduction, binned_note
 from instrument.reconstruction.options import InputOptions, VideoOptions
 from instrument.reconstruction.preparation import Crop
 from instrument.reconstruction.request import PictureRequest
@@ -167,7 +167,8 @@ def prepare_video(request: VideoRequest, *, force: bool = False) -> PreparedVide
     warnings += filter(None, (_doubt(problem),))
     if missing := run.n_frames - len(frames):
         warnings.append(f"{missing} of {run.n_frames} frames were lost when recording: they stay NaN.")
-    notes = {**picture.notes, "Image": f"{run.path}: {len(frames)} frames"}
+    pixels = binned_note(picture.reduction.first_binning) if request.calibration is not None else ""
+    notes = {**picture.notes, "Image": f"{run.path}: {len(frames)} frames{pixels}"}
     notes["Model"] = f"{problem.model}: {problem.reason}" if problem.reason else problem.model
     return PreparedVideo(job, request, notes, tuple(warnings), resumed)
 

@@ -379,10 +379,11 @@ def _coded(
     other = straightened.otherwise(better or FAR[0]).unexplained(background=lit)
     if straightened.unexplained(background=lit) >= STRAIGHTER * other:
         return None
-    what_to_do = "Take raw frames, or files in proportion to the light (JPEG files and webcams' are not)"
-    if not lit:  # volumes have no --srgb
-        what_to_do += f". What is sRGB is straightened by --srgb {how.option}"
-    return f"its PSF explains it better where {how.words} gamma-coded", what_to_do
+    return (
+        f"its PSF explains it better where {how.words} gamma-coded",
+        "Take raw frames, or files in proportion to the light (JPEG files and webcams' are not). What is "
+        f"sRGB is straightened by --srgb {how.option}",
+    )
 
 
 def _given(problem: Problem) -> Problem:

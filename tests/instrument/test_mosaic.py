@@ -1,6 +1,7 @@
 """Raw frames of colour mosaics, from the file to the colour picture."""
 
 import json
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -10,11 +11,14 @@ from scipy.signal import fftconvolve
 from instrument.cli import main
 from instrument.files.errors import BenchError, FileError
 from instrument.files.images import ImageFile, read_image, write_image
+from instrument.reconstruction.job import job_with
 from instrument.reconstruction.mosaic import mosaic_named, mosaic_of, reduce_mosaic, require_mosaic
+from instrument.reconstruction.options import InputOptions
 from instrument.reconstruction.preparation import Crop
 from instrument.reconstruction.video_files import VideoPictures
 from recon.camera.factors import PATTERNS
 from recon.errors import InputError
+from recon.types import Calibration
 from tests.mocks.recordings import write_recording
 
 HEIGHT, WIDTH = 36, 48
@@ -50,6 +54,16 @@ def test_an_odd_binning_and_a_colour_file_are_refused():
         mosaic_named("RGBG")
     with pytest.raises(FileError, match="a raw RGGB frame is grey"):
         require_mosaic(ImageFile("x.tif", np.zeros((4, 4, 3), np.uint8)), "RGGB")
+
+
+def test_pixels_of_which_an_odd_number_make_one_of_the_calibrations_are_refused_by_what_they_are():
+    psf = np.random.default_rng(0).random((1, 1, 12, 16)).astype(np.float32)
+    calibration = Calibration(psf, np.full((1, 3), np.nan))
+    raw = ImageFile(Path("raw.tif"), np.arange(36 * 48, dtype=np.uint16).reshape(36, 48))
+    with pytest.raises(FileError, match="3 x 3 of its pixels make one") as refused:
+        job_with(calibration, Path("cal"), raw, InputOptions(mosaic="RGGB"))
+    assert "--bin" not in str(refused.value)
+    assert job_with(calibration, Path("cal"), raw, InputOptions(mosaic=None)).measurement.shape == (12, 16)
 
 
 def test_metadata_name_the_mosaic():

@@ -13,6 +13,7 @@ from instrument.files.errors import BenchError, FileError
 from instrument.files.images import ImageFile
 from instrument.reconstruction.job import job_from_files, job_with, source_record
 from instrument.reconstruction.options import InputOptions
+from instrument.reconstruction.request import volume_job
 from instrument.reconstruction.straightened import SrgbChoice, straightened
 from recon.types import Calibration
 
@@ -55,6 +56,24 @@ def test_what_is_named_is_straightened_and_told(which: SrgbChoice) -> None:
     ):
         likeness = float(np.corrcoef(found.ravel(), given.ravel())[0, 1])
         assert (likeness > 0.9999) is (which in (name, "both"))
+    assert ("sRGB" in job.notes) is (which != "none")
+    assert job.provenance["srgb"] == which
+
+
+@pytest.mark.parametrize("which", ["none", "photograph", "psf", "both"])
+def test_a_volume_of_coded_files_is_straightened_as_a_picture_is(which: SrgbChoice) -> None:
+    rng = np.random.default_rng(2)
+    pixels = rng.integers(0, 255, (3, *SHAPE)).astype(np.uint8)
+    psfs, image = ImageFile(Path("psfs.tif"), pixels[:2]), file(pixels[2])
+    options = InputOptions(dark=0.0, erasures="none")
+    job = volume_job(psfs, image, replace(options, srgb=which))
+    by_hand = volume_job(
+        straightened(psfs) if which in ("psf", "both") else psfs,
+        straightened(image) if which in ("photograph", "both") else image,
+        options,
+    )
+    np.testing.assert_array_equal(job.measurement, by_hand.measurement)
+    np.testing.assert_array_equal(job.calibration.psfs, by_hand.calibration.psfs)
     assert ("sRGB" in job.notes) is (which != "none")
     assert job.provenance["srgb"] == which
 

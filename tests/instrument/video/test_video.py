@@ -41,6 +41,7 @@ from recon.evaluation.scene import make_scene
 from recon.reconstruction.options import ReconstructionOptions
 from recon.streams.stillness import has_light
 from recon.streams.video import VideoSolver
+from recon.types import Calibration
 from tests.instrument.video.recorded import (
     MISSING,
     SHAPE,
@@ -331,6 +332,22 @@ def test_prepared_is_what_the_window_shows(recording: Path, tmp_path: Path) -> N
     assert any("1 of 11 frames were lost" in warning for warning in prepared.warnings)
     assert prepared.notes["Dark"].startswith("20 counts")
     assert choice_in_words(prepared, 5.0, 1.0) == "", "one PSF: nothing was chosen"
+
+
+@pytest.mark.parametrize("times", [1, 2])
+def test_a_film_tells_what_was_binned_to_the_calibrations_pixels(tmp_path: Path, times: int) -> None:
+    calibration = Calibration(cast([(0, 0, 1.0)])[None, None].astype(np.float32), np.full((1, 3), np.nan))
+    save_calibration(calibration, tmp_path / "calibration")
+    frames = {t: np.kron(scene(t), np.ones((times, times), np.uint16)) for t in range(2)}
+    wanted = VideoRequest(
+        run=write_recording(tmp_path, frames),
+        out=tmp_path / "v.ome.zarr",
+        calibration=tmp_path / "calibration",
+        inputs=InputOptions(dark=20.0, binning=1),
+        video=VideoOptions(film=False),
+    )
+    said = prepare_video(wanted).notes["Image"]
+    assert said.endswith("2 frames, binned 2 x 2 to the calibration" if times == 2 else "2 frames")
 
 
 def test_auto_takes_the_model_that_the_film_asks_for_and_depths_become_volumes(tmp_path: Path) -> None:
