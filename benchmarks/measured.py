@@ -294,6 +294,7 @@ def main() -> None:
     parser.add_argument("--threads", type=int, default=get_threads())
     asked = parser.parse_args()
     set_threads(asked.threads)
+    asked.out.mkdir(parents=True, exist_ok=True)
     page = asked.out / "measured-data.md"
     text = page.read_text() if page.exists() else HEAD
     for name in asked.only:

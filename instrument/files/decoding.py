@@ -29,13 +29,42 @@ _MOST_HEADER, _MOST_LISTING = 1 << 16, 1 << 20
 _RAW_SUFFIXES = (".arw", ".cr2", ".cr3", ".crw", ".dng", ".nef", ".orf", ".pef", ".raf", ".raw", ".rw2")
 _ZARR_MARKS = {"zarr.json", ".zgroup", ".zarray"}
 _TEXT_SUFFIXES = (".csv", ".dat", ".tsv", ".txt")
+_LOSSY = "which is made for the eye and not read. Take the camera's own files, or save it as PNG"
+_AS_STACK = "which is not read. Export it as OME-TIFF (in Fiji: Bio-Formats)"
+_FILM = (
+    "is a compressed film: its frames are no measurement any more. Take a recording, or images that are not "
+    "compressed."
+)
+_OTHERS: tuple[tuple[int, bytes, str], ...] = (
+    (8, b"WEBP", f"is a WebP picture, {_LOSSY}."),
+    (4, b"ftypheic", f"is a HEIC picture, {_LOSSY}."),
+    (4, b"ftypmif1", f"is a HEIC picture, {_LOSSY}."),
+    (4, b"ftypavif", f"is an AVIF picture, {_LOSSY}."),
+    (4, b"ftyp", _FILM),
+    (8, b"AVI ", _FILM),
+    (0, b"\x1aE\xdf\xa3", _FILM),
+    (0, b"GIF8", f"is a GIF picture of 256 colours, {_LOSSY}."),
+    (0, b"v/1\x01", "is an OpenEXR picture, which is not read. Save it as 32-bit TIFF."),
+    (
+        0,
+        b"SIMPLE  =",
+        "is a FITS file. Make an array of it: numpy.save('NAME.npy', astropy.io.fits.getdata(FILE)).",
+    ),
+    (0, b"ZISRAWFILE", f"is a Zeiss CZI file, {_AS_STACK}."),
+    (0, b"\xda\xce\xbe\n", f"is a Nikon ND2 file, {_AS_STACK}."),
+    (0, b"\x70\0\0\0", f"is a Leica LIF file, {_AS_STACK}."),
+)
+"""Where others' files say what they are, and what to do; the first that fits counts."""
 
 
-def _unreadable(path: Path) -> str:
+def _unreadable(path: Path, beginning: bytes) -> str:
     """Say of a file that begins as none which is read what it may be, and what to do."""
     suffix = path.suffix.lower()
     if suffix in _RAW_SUFFIXES:
         return RAW
+    for at, mark, words in _OTHERS:
+        if beginning[at:].startswith(mark):
+            return words
     if suffix in _TEXT_SUFFIXES:
         return "is text, no image. Make an array of its numbers: numpy.save('NAME.npy', numpy.loadtxt(FILE))."
     if suffix == ".mat":
@@ -71,7 +100,7 @@ def decode(path: Path, inside: str, expect: Expect) -> Decoded:
         raise FileError(path, f"is no HDF5, MATLAB or .npz file, so that nothing in it is called {inside}.")
     known = (b"\x93NUMPY", *_TIFF_MAGIC, *MAGIC)
     if beginning and not beginning.startswith(known):  # before its size, which may be huge, is read
-        raise FileError(path, _unreadable(path))
+        raise FileError(path, _unreadable(path, beginning))
     if beginning[8:10] == b"CR" and beginning[:4] in _TIFF_MAGIC:  # Canon's, a TIFF of its thumbnail
         raise FileError(path, RAW)
     if beginning.startswith(b"\x93NUMPY"):
@@ -81,6 +110,35 @@ def decode(path: Path, inside: str, expect: Expect) -> Decoded:
     if beginning[:4] in _TIFF_MAGIC:
         return decode_tiff(path, expect)
     return decode_picture(path)
+
+
+_DEPTHS_UM = {
+    f"{what}_{unit}": um for what in ("depths", "depth", "z") for unit, um in (("um", 1.0), ("mm", 1e3))
+}
+"""Names of arrays that tell where the images of their file's stack lie, and their unit."""
+
+
+def depths_beside(path: Path, count: int) -> list[float]:
+    """Return where so many images lie, as an array of their HDF5, MATLAB or .npz file tells by its name.
+
+    Micrometres; empty where none does.
+    """
+    with path.open("rb") as file:
+        beginning = file.read(_BEGINNING)
+    if not (is_hdf5(beginning) or is_matlab(beginning) or beginning.startswith(b"PK")):
+        return []
+
+    def of_each(told: npt.NDArray[Any]) -> None:
+        if told.size != count:
+            raise FileError(path, "tells of other images.")
+
+    for name, um in _DEPTHS_UM.items():
+        try:
+            told, _ = decode(path, name, of_each)
+        except FileError:
+            continue
+        return [um * float(z) for z in told.ravel()]
+    return []
 
 
 def require_npy(path: Path) -> None:

@@ -21,7 +21,7 @@ import tifffile
 
 from instrument.files import reading
 from instrument.files.atomic import whole_file, write_text
-from instrument.files.decoding import decode
+from instrument.files.decoding import decode, depths_beside
 from instrument.files.errors import BenchError, FileError
 from instrument.files.image_folders import images_in, in_order, order_in_words
 from instrument.files.named_arrays import is_zarr, read_zarr, zarr_facts
@@ -337,7 +337,7 @@ def _as_stack(path: Path, array: npt.NDArray[Any], notes: tuple[str, ...]) -> Im
         raise FileError(path, f"holds an array of shape {array.shape}; a stack of images is expected.")
     pixels, converted = _standard_dtype(path, array)
     told = image_metadata(path) if path.is_file() or is_zarr(path) else {}
-    depths = told.pop("depths_um", [])
+    depths = told.pop("depths_um", []) or (depths_beside(path, len(pixels)) if path.is_file() else [])
     words: tuple[str, ...] = ()
     if len(depths) == len(pixels) > 1:
         told["depths_um"] = depths

@@ -27,6 +27,7 @@ MISTAKES: list[tuple[list[str], str]] = [
     ([*RECONSTRUCT, "--psf", "absent.tif", "--image", "photo.tif"], "there is no such file"),
     ([*RECONSTRUCT, "--psf", "plain", "--image", "photo.tif"], "in a folder are given by --volume"),
     ([*RECONSTRUCT, "--psf", "/proc", "--image", "photo.tif"], "is a folder; a file is expected"),
+    ([*RECONSTRUCT, "--psf", "psf.tif", "--image", "film.tif"], "by diffuserbench import FILE"),
     ([*RECONSTRUCT, "--psf", "text.tif", "--image", "photo.tif"], "is no image that can be read"),
     ([*RECONSTRUCT, "--psf", "empty.tif", "--image", "photo.tif"], "is empty"),
     ([*RECONSTRUCT, "--image", "photo.tif"], "Give either --psf FILE or --calibration FOLDER"),
@@ -93,6 +94,7 @@ def files(tmp_path_factory: pytest.TempPathFactory) -> Path:
         "small": psf[:20, :24],
         "eight": (psf >> 8).astype(np.uint8),
         "black": np.zeros_like(psf),
+        "film": np.stack([photo] * 5),
         "huge": (psf * 1e33).astype(np.float32),
         "holes": np.where(psf == psf.max(), np.nan, psf).astype(np.float32),
     }

@@ -164,3 +164,47 @@ def test_a_stack_where_one_picture_is_wanted_is_refused_before_its_pixels_are_re
             monkeypatch.setattr(zarr.Array, "__getitem__", lambda *_: pytest.fail("read"))
     with pytest.raises(FileError, match=rf"{name}: holds 5 images; a single one is expected\..* mean\.$"):
         read_image(path)
+
+
+@pytest.mark.parametrize("suffix", [".h5", ".npz", ".mat"])
+@pytest.mark.parametrize(
+    ("name", "depths"), [("z_um", [1e4, 2e4, 3e4, 5e4]), ("depths_mm", [10.0, 20.0, 30.0, 50.0])]
+)
+def test_an_array_beside_a_stack_tells_its_depths(
+    tmp_path: Path, suffix: str, name: str, depths: list[float]
+) -> None:
+    stack = np.random.default_rng(0).integers(0, 999, (4, 20, 30)).astype(np.uint16)
+    path = tmp_path / f"psfs{suffix}"
+    if suffix == ".h5":
+        with h5py.File(path, "w") as file:
+            file["psfs"], file[name] = stack, depths
+    elif suffix == ".npz":
+        np.savez(path, **{"psfs": stack, name: np.array(depths)})
+    else:
+        scipy.io.savemat(path, {"psfs": np.moveaxis(stack, 0, -1), name: np.array(depths)})
+    read = read_stack(f"{path}::psfs")
+    assert np.array_equal(read.pixels, stack)
+    assert read.metadata["depths_um"] == [1e4, 2e4, 3e4, 5e4]
+    assert any("10" in note and "50" in note for note in read.notes), read.notes
+
+
+def test_an_array_of_other_images_tells_no_depths(tmp_path: Path) -> None:
+    np.savez(tmp_path / "psfs.npz", psfs=np.ones((3, 20, 30), np.float32), z_um=[1.0, 2.0])
+    assert "depths_um" not in read_stack(f"{tmp_path / 'psfs.npz'}::psfs").metadata
+
+
+@pytest.mark.parametrize(
+    ("beginning", "says"),
+    [
+        (b"RIFF\x10\0\0\0WEBPVP8 ", "is a WebP picture, .* save it as PNG"),
+        (b"\0\0\0\x18ftypheic", "is a HEIC picture"),
+        (b"\0\0\0\x18ftypisom", "is a compressed film"),
+        (b"RIFF\x10\0\0\0AVI LIST", "is a compressed film"),
+        (b"ZISRAWFILE", "is a Zeiss CZI file, .* Export it as OME-TIFF"),
+        (b"SIMPLE  =                    T", "is a FITS file. Make an array"),
+    ],
+)
+def test_others_files_are_called_by_what_they_are(tmp_path: Path, beginning: bytes, says: str) -> None:
+    (tmp_path / "photo").write_bytes(beginning + bytes(100))
+    with pytest.raises(FileError, match=says):
+        read_image(tmp_path / "photo")
