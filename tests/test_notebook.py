@@ -18,6 +18,7 @@ import tifffile
 
 import diffuserbench as db
 from instrument.bench.config_file import template
+from instrument.files.calibration_file import save_calibration
 from instrument.files.errors import BenchError
 from instrument.files.images import ImageFile, write_image
 from instrument.notebook.hologram import _depths
@@ -27,6 +28,8 @@ from recon.base.declare import options_of
 from recon.errors import InputError
 from recon.evaluation.scene import make_scene
 from recon.reconstruction.options import ReconstructionOptions
+from recon.types import Calibration
+from tests.mocks.recordings import write_recording
 from tests.test_tutorials import code_of
 
 ROOT = Path(__file__).parents[1]
@@ -115,6 +118,56 @@ def test_what_it_takes_is_told_before_as_the_terminal_tells_it(
         db.forecast(*files, itterations=3)
     shown = db.forecast_hologram("portrait", "display", slm=(32, 32), iterations=3)
     assert " ms an iteration, 3 of them" in str(shown)
+
+
+def test_what_a_recordings_film_takes_is_told_and_nothing_of_it_is_left(
+    scene: tuple[np.ndarray, np.ndarray], tmp_path: Path
+) -> None:
+    photo, psf = scene
+    recorded = write_recording(tmp_path, {n: photo // (n + 1) for n in range(3)})
+    write_image(tmp_path / "psf.tif", psf)
+    save_calibration(
+        Calibration(plain(scene)[1][None, None], np.full((1, 3), np.nan)), tmp_path / "calibration"
+    )
+    lying = set(tmp_path.rglob("*"))
+    for run, place, options in (
+        (recorded, tmp_path / "psf.tif", {"over_time": "tv", "block": 2}),
+        (db.run(recorded), str(tmp_path / "calibration"), {"warm_iterations": 1}),
+    ):
+        told = db.forecast(run, place, iterations=2, model="convolution", film=False, **options)
+        assert (told.settles, told.each, told.counted) == (3, "frame", True)
+        assert told.seconds > 0
+    assert set(tmp_path.rglob("*")) == lying
+    with pytest.raises(BenchError, match="warm_iterations: for a video, not for a patterned picture"):
+        db.forecast(recorded, place, patterned=recorded, warm_iterations=1)
+    with pytest.raises(BenchError, match="by its file, or by its calibration's folder, not ndarray"):
+        db.forecast(recorded, psf)
+    with pytest.raises(BenchError, match=r"a run of 3 frames: .* --video makes its film"):
+        db.reconstruct(recorded, place)
+
+
+def test_light_that_falls_off_is_given_to_arrays_and_files(
+    scene: tuple[np.ndarray, np.ndarray], tmp_path: Path
+) -> None:
+    photo, psf = plain(scene)
+    shade = np.linspace(0.4, 1.0, photo.size).reshape(photo.shape).astype(np.float32)
+    options = {"iterations": 3, "judged": False, "model": "convolution"}
+    expected = db.reconstruct(photo, psf, **options)
+    np.testing.assert_allclose(
+        db.reconstruct(photo * shade, psf, vignetting=shade, **options).image, expected.image, rtol=1e-3
+    )
+    write_image(tmp_path / "photo.tif", np.kron(photo * shade, np.ones((2, 2), np.float32)))
+    write_image(tmp_path / "psf.tif", np.kron(psf, np.ones((2, 2), np.float32)))
+    flat = np.kron(np.round(60_000 * shade), np.ones((2, 2))).astype(np.uint16)  # counts, as one is taken
+    files = tmp_path / "photo.tif", tmp_path / "psf.tif"
+    found = db.reconstruct(*files, vignetting=flat, binning=2, dark=0.0, erasures="none", **options)
+    assert db.metrics.psnr(found.image / found.image.max(), expected.image / expected.image.max()) > 40
+    assert "0.4 to 1" in found.job.notes["Light"]
+    with pytest.raises(BenchError, match="give it on the photograph's own pixels"):
+        db.reconstruct(*files, vignetting=shade[:20], **options)
+    with pytest.raises(BenchError, match="background: for arrays"):
+        db.reconstruct(*files, background=1.0)
+    assert {"vignetting", "background", "patterns"} <= set(inspect.signature(db.reconstruct).parameters)
 
 
 def test_options_are_completed_and_nothing_is_ignored(scene: tuple[np.ndarray, np.ndarray]) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from numbers import Real
 from pathlib import Path
 from typing import Any, Self
@@ -12,10 +12,13 @@ import numpy as np
 import numpy.typing as npt
 
 from instrument.files.errors import BenchError
+from instrument.files.image_folders import images_in
 from instrument.files.images import ImageFile, read
-from instrument.reconstruction.job import Job, job_from_files, job_with
+from instrument.reconstruction.job import Job, job_from_files, job_with, source_record
 from instrument.reconstruction.options import InputOptions
 from instrument.reconstruction.request import refocused, volume_job
+from instrument.runs.run import Run
+from instrument.runs.run_files import is_run
 from recon.base.checks import as_channels
 from recon.base.declare import options_of, require, require_known, with_overrides
 from recon.errors import InputError
@@ -29,6 +32,8 @@ Psf = Path | str | ImageFile | Calibration | npt.ArrayLike
 
 _INPUTS = {f.name for f in fields(InputOptions)}
 _FILES_ONLY = _INPUTS - set(one_door.FACTS)
+FACTS = tuple(name for name in one_door.FACTS if name not in _INPUTS)
+"""What is known of a photograph by arrays, in Python only."""
 
 
 @dataclass(frozen=True)
@@ -47,17 +52,33 @@ class Asked:
         """Bring them together; errors as :func:`~instrument.notebook.reconstruct.reconstruct`."""
         image, psf = getattr(image, "measurement", image), getattr(psf, "calibration", psf)
         overrides = dict(overrides)
-        require_known(overrides, ReconstructionOptions, InputOptions)
+        if (film := recording_of(image)) is not None:
+            raise BenchError(
+                f"{film.path} is a run of {len(film.records)} frames: diffuserbench reconstruct "
+                f"{film.path} --video makes its film (db.forecast tells what that takes); a frame of it is "
+                f"db.run({str(film.path)!r}).frame(0)."
+            )
+        require_known([name for name in overrides if name not in FACTS], ReconstructionOptions, InputOptions)
         if not isinstance(options, ReconstructionOptions | None):
             raise BenchError(
                 f"options are db.Options(...), not {type(options).__name__}; single ones are given by name: "
                 "prior='l1', warm=result."
             )
         if _is_file(image) or _is_file(psf):
-            inputs = _inputs({name: overrides.pop(name) for name in _INPUTS & set(overrides)})
+            if about := [name for name in FACTS if name in overrides and name != "vignetting"]:
+                raise BenchError(
+                    f"{' and '.join(about)}: for arrays (db.read(FILE).pixels is one). Of a file the "
+                    "background is taken off by dark=, and patterned light is a run's: diffuserbench "
+                    "reconstruct RUN --patterned."
+                )
+            shade = overrides.pop("vignetting", None)
+            inputs = inputs_of({name: overrides.pop(name) for name in _INPUTS & set(overrides)})
             options = with_overrides(options or ReconstructionOptions(), overrides)
             job = _job(_opened(image, "photograph"), psf, inputs, options)
-            return cls(job.as_measurement(inputs.noise), job.calibration, options, job)
+            measurement = job.as_measurement(inputs.noise)
+            if shade is not None:
+                job, measurement = _divided(job, measurement, _opened(shade, "vignetting"))
+            return cls(measurement, job.calibration, options, job)
         if about := sorted(_FILES_ONLY & set(overrides)):
             raise BenchError(
                 f"{' and '.join(about)}: for files and images of db.read; arrays are taken as they are. "
@@ -73,6 +94,36 @@ class Asked:
     def job(self) -> Job:
         """What it is reconstructed from."""
         return self.prepared or _job_of_arrays(self.measurement, self.calibration)
+
+
+def _divided(job: Job, measurement: Measurement, shade: ImageFile) -> tuple[Job, Measurement]:
+    """Return a photograph with its relative light, given on the file's pixels, cut and binned as it was."""
+    assert job.reduction is not None  # of files
+    light = replace(job.reduction, dark=0.0).apply(shade.pixels)
+    if shade.pixels.dtype.kind == "u" and light.max() > 0:  # a flat field in counts
+        light = light / light.max()
+    if light.shape[:2] != job.measurement.shape[:2]:
+        raise BenchError(
+            f"The vignetting is {shade.describe()}, and comes to {light.shape[0]} x {light.shape[1]} pixels "
+            f"where the photograph comes to {job.measurement.shape[0]} x {job.measurement.shape[1]}: give it "
+            "on the photograph's own pixels."
+        )
+    said = f"divided by the vignetting that was given, {light.min():.3g} to {light.max():.3g}"
+    told = {"vignetting": source_record(shade)}
+    made = replace(job, notes={**job.notes, "Light": said}, provenance={**job.provenance, **told})
+    return made, replace(measurement, vignetting=light)
+
+
+def recording_of(given: Any) -> Run | None:
+    """Return the recording that a run or its folder is; None for a photograph, in a run of its own or not."""
+    if isinstance(given, Run):
+        return given
+    if not isinstance(given, Path | str):
+        return None
+    folder = Path(given)
+    if not is_run(folder) or len(images_in(folder)) == 1:
+        return None
+    return Run.open(folder)
 
 
 def _require_one(image: Any, psf: Any) -> None:
@@ -127,7 +178,7 @@ def _opened(given: Any, name: str) -> ImageFile:
     return ImageFile(Path(f"the {name}, an array"), pixels)
 
 
-def _inputs(given: Mapping[str, Any]) -> InputOptions:
+def inputs_of(given: Mapping[str, Any]) -> InputOptions:
     """Return options of files; words are read as the terminal reads them, and numbers in a row as words."""
     declared = {o.name: o.declaration for o in options_of(InputOptions)}
     read: dict[str, Any] = {}

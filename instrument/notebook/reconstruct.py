@@ -6,7 +6,7 @@ import inspect
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -17,13 +17,14 @@ from instrument.bench.config_file import TEMPLATES, load_config, parse_config, t
 from instrument.bench.source_and_scene import Ask
 from instrument.files.calibration_file import is_calibration, load_calibration
 from instrument.files.errors import BenchError
-from instrument.notebook.asked import Asked, Image, Psf
+from instrument.notebook.asked import FACTS, Asked, Image, Psf, recording_of
+from instrument.notebook.of_runs import PATTERNED, forecast_of_run
 from instrument.notebook.result import Result
 from instrument.notebook.words import speaking
 from instrument.reconstruction import forecast as by_its_beginning
 from instrument.reconstruction.forecast import Forecast
 from instrument.reconstruction.job import find_calibration
-from instrument.reconstruction.options import InputOptions
+from instrument.reconstruction.options import InputOptions, VideoOptions
 from instrument.runs.run import Run
 from instrument.runs.run_files import is_run
 from recon.base.arguments import require_argument
@@ -124,7 +125,9 @@ def reconstruct(
         Single options by name: of the reconstruction (``prior="l1"``, ``iterations=50``, ``z_um=30e3``), and
         of how files are read (``dark``, ``crop``, ``binning``, ``erasures``, ``mosaic``, ``noise``), as
         values or in the words of the terminal (``dark="dark.tif"``, ``crop=(20, 30, 400, 600)``); ``dark``
-        may be an image or array, too.
+        may be an image or array, too. And what is known of the light: ``vignetting``, relative light on the
+        photograph's own pixels (a file, image or array) that it is divided by; of arrays also ``background``
+        and ``patterns``, as :class:`~recon.reconstruction.measurement.Measurement` has them.
 
     Raises InputError, BenchError or FileError: what was found, what was expected, what to do.
     """
@@ -147,7 +150,7 @@ def reconstruct(
 
 @speaking
 def forecast(
-    image: Image,
+    image: Image | Run,
     psf: Psf,
     options: ReconstructionOptions | None = None,
     *,
@@ -162,9 +165,14 @@ def forecast(
     Parameters
     ----------
     image, psf, options, on_stage, **overrides
-        As :func:`reconstruct`, whose errors it raises.
+        As :func:`reconstruct`, whose errors it raises. A recording (:func:`run`, or its folder) with a PSF's
+        file or a calibration's folder stands for its film, with the film's options by name (``block``,
+        ``workers`` ...); with ``patterned``, a sheet's run or its patterns as ``.npy``, for the picture of a
+        run in patterned light. Of both all that ``diffuserbench reconstruct RUN`` would do is told.
     """
     with _telling(on_stage) as told:
+        if (run_of_frames := recording_of(image)) is not None:
+            return forecast_of_run(run_of_frames, psf, options, overrides, told)
         asked = Asked.of(image, psf, options, overrides)
         return by_its_beginning.forecast(asked.measurement, asked.calibration, asked.options, told)
 
@@ -215,18 +223,27 @@ def _telling(on_stage: Stage | None) -> Iterator[Stage]:
         told.end()
 
 
-def _with_options(function: Callable[..., Any], returned: type) -> inspect.Signature:
+def _with_options(
+    function: Callable[..., Any], returned: type, *further: type, facts: Sequence[str] = ()
+) -> inspect.Signature:
     """Return the signature with every option by name: what a notebook completes."""
     own = [p for p in inspect.signature(function).parameters.values() if p.kind is not p.VAR_KEYWORD]
     known = {p.name for p in own}
-    declared = {o.name: o for o in (*options_of(ReconstructionOptions), *options_of(InputOptions))}
+    kinds = (ReconstructionOptions, InputOptions, *further)
+    declared = {o.name: o for kind in kinds for o in options_of(kind)}
     named = [
         inspect.Parameter(o.name, inspect.Parameter.KEYWORD_ONLY, default=o.default, annotation=o.type)
         for o in declared.values()
         if o.name not in known
     ]
+    named += [
+        inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=None, annotation=Any)
+        for name in facts
+    ]
     return inspect.Signature([*own, *named], return_annotation=returned)
 
 
-reconstruct.__signature__ = _with_options(reconstruct, Result)  # type: ignore[attr-defined]
-forecast.__signature__ = _with_options(forecast, Forecast)  # type: ignore[attr-defined]
+reconstruct.__signature__ = _with_options(reconstruct, Result, facts=FACTS)  # type: ignore[attr-defined]
+forecast.__signature__ = _with_options(  # type: ignore[attr-defined]
+    forecast, Forecast, VideoOptions, facts=(*FACTS, PATTERNED)
+)

@@ -202,7 +202,7 @@ class InputOptions:
         "none",
         help="sRGB files to straighten.",
         label="Files coded for the eye (sRGB)",
-        applies=("picture",),
+        applies=("picture", "volume"),
         group=RARE,
     )
     allow_saturated: bool = option(
@@ -258,7 +258,7 @@ class OutputOptions:
     explain: bool = option(
         False,
         help="Only say what auto would choose, why, and what time and memory it takes.",
-        applies=(*_KEPT, "video"),
+        applies=_EVERY,
         group=_OUTPUT,
     )
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import threading
+import time
 import zipfile
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
@@ -17,6 +18,7 @@ from instrument.files.calibration_file import load_calibration
 from instrument.files.errors import BenchError, FileError, count
 from instrument.files.images import ImageFile
 from instrument.plan.illumination import DARK, PATTERN
+from instrument.reconstruction.forecast import Forecast, forecast
 from instrument.reconstruction.job import Job, find_calibration, job_with, matching_binning
 from instrument.reconstruction.mosaic import pattern_of
 from instrument.reconstruction.options import InputOptions
@@ -24,8 +26,10 @@ from instrument.reconstruction.request import refocused
 from instrument.runs.run import Run
 from recon import Measurement, reconstruct
 from recon.reconstruction.options import ReconstructionOptions
+from recon.reconstruction.problem import Stage
 from recon.reconstruction.result import Reconstruction
 from recon.solvers.base import IterationRecord, Keeper
+from recon.solvers.memory import MemoryMeter
 from recon.types import Calibration
 
 Floats = npt.NDArray[np.float32]
@@ -74,6 +78,10 @@ class PreparedPatterned:
     measurement: Measurement
     """All frames, with what is known of them, under the patterns: shares of the light of all groups."""
     request: PatternedRequest
+    seconds: float
+    """That preparing took, the patterns included."""
+    meter: MemoryMeter
+    """Begun before it."""
 
 
 def prepare_patterned(
@@ -86,6 +94,7 @@ def prepare_patterned(
     Raises FileError, BenchError or InputError when something cannot be used, or the runs do not belong
     together.
     """
+    meter, began_s = MemoryMeter(), time.perf_counter()
     folder = find_calibration(request.calibration)
     calibration = replace(load_calibration(folder), background=None)
     run = Run.open(request.run)
@@ -136,7 +145,8 @@ def prepare_patterned(
             )
     noise = job.binned_noise(request.inputs.noise)
     measurement = Measurement(lit.frames, noise, erasures=lit.erased, patterns=patterns)
-    return PreparedPatterned(replace(job, warnings=tuple(warnings)), measurement, request)
+    job = replace(job, warnings=tuple(warnings))
+    return PreparedPatterned(job, measurement, request, time.perf_counter() - began_s, meter)
 
 
 def _whole_colours(inputs: InputOptions, run: Run, calibration: Calibration, folder: Path) -> InputOptions:
@@ -173,6 +183,13 @@ def solve_patterned(
         cancel=cancel,
         keeper=keeper,
     )
+
+
+def forecast_patterned(prepared: PreparedPatterned, on_stage: Stage | None = None) -> Forecast:
+    """Say what time and memory all of it takes, its patterns too; errors as :func:`solve_patterned`."""
+    told = forecast(prepared.measurement, prepared.job.calibration, prepared.request.options, on_stage)
+    taken = prepared.meter.peak_mib() * 2**20
+    return replace(told, beside_s=told.beside_s + prepared.seconds, memory_bytes=taken)
 
 
 @dataclass(frozen=True, slots=True)

@@ -2,17 +2,25 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Annotated
 
 from instrument.files.errors import BenchError
 from instrument.files.orientation import AS_IT_IS
 from instrument.reconstruction.checkpointing import checkpoint_for, settle_checkpoint
+from instrument.reconstruction.forecast import Forecast
 from instrument.reconstruction.foretold import Foretold, Like
 from instrument.reconstruction.job import Job
 from instrument.reconstruction.options import InputOptions, OutputOptions, SourceOptions
-from instrument.reconstruction.patterned import PatternedRequest, prepare_patterned, solve_patterned
+from instrument.reconstruction.patterned import (
+    PatternedRequest,
+    forecast_patterned,
+    prepare_patterned,
+    solve_patterned,
+)
 from instrument.reconstruction.request import PictureRequest, VolumeRequest
 from instrument.reconstruction.result_file import Outputs, write_reconstruction, write_volume
 from instrument.tasks.task import Desk, Done, Only, saying_what_is_left, task
@@ -20,6 +28,7 @@ from instrument.volumes.grid_facts import uneven_steps
 from recon.base.declare import option
 from recon.reconstruction.choice import Choice
 from recon.reconstruction.options import ReconstructionOptions
+from recon.reconstruction.problem import Stage
 from recon.reconstruction.result import Reconstruction
 from recon.reconstruction.solve import ITERATIONS
 from recon.solvers.base import IterationRecord, StopReason
@@ -42,10 +51,7 @@ def reconstruct_photograph(
             _tell_choice(desk, choice)
         else:
             desk.fact("Model", f"{request.options.model}, as asked for: nothing is chosen")
-        with desk.step("the first iterations", 100) as advance:
-            told = request.forecast(job, lambda share, what: advance(round(100 * share), note=what))
-        desk.fact("Will take", str(told))
-        return Done()
+        return _told(desk, partial(request.forecast, job))
     outputs.check(0, overwrite=output.force)
     is_volume = isinstance(request, VolumeRequest)
     with saying_what_is_left(*outputs.files()):
@@ -83,6 +89,14 @@ def reconstruct_photograph(
     return _ended(outputs, result, what)
 
 
+def _told(desk: Desk, forecast: Callable[[Stage], Forecast]) -> Done:
+    """Say what time and memory it takes, by its first iterations."""
+    with desk.step("the first iterations", 100) as advance:
+        told = forecast(lambda share, what: advance(round(100 * share), note=what))
+    desk.fact("Will take", str(told))
+    return Done()
+
+
 @dataclass(frozen=True, kw_only=True)
 class PatternedRuns:
     """What was photographed in patterned light."""
@@ -102,7 +116,7 @@ def patterned(
     source: Annotated[SourceOptions, Only("patterned", "calibration")],
     inputs: Annotated[InputOptions, Only("crop", "binning", "erasures", "mosaic", "noise")],
     options: ReconstructionOptions,
-    output: Annotated[OutputOptions, Only("out", "rotate_deg", "figure", "checkpoint", "force")],
+    output: Annotated[OutputOptions, Only("out", "rotate_deg", "figure", "checkpoint", "explain", "force")],
 ) -> Done:
     """Reconstruct one picture of a scene that was lit by patterns in turn (Kuo 2020, Section 8.2)."""
     if source.patterned is None or source.calibration is None:
@@ -123,7 +137,9 @@ def patterned(
 def reconstruct_patterns(
     desk: Desk, request: PatternedRequest, outputs: Outputs, output: OutputOptions
 ) -> Done:
-    """Reconstruct the patterns, then the picture; tell, write."""
+    """Reconstruct the patterns, then the picture; tell, write. ``explain``: only say what it takes."""
+    if output.explain:
+        return _explain_patterns(desk, request)
     outputs.check(0, overwrite=output.force)
     with saying_what_is_left(*outputs.files()):
         with desk.step("patterns") as advance:
@@ -146,6 +162,13 @@ def reconstruct_patterns(
         for name, text in settle_checkpoint(keeper, result.stop_reasons).items():
             desk.fact(name, text)
     return _ended(outputs, result, "picture")
+
+
+def _explain_patterns(desk: Desk, request: PatternedRequest) -> Done:
+    """Reconstruct the patterns, and say what they and the picture take."""
+    with desk.step("patterns") as advance:
+        prepared = prepare_patterned(request, advance)
+    return _told(desk, partial(forecast_patterned, prepared))
 
 
 def _tell_choice(desk: Desk, choice: Choice) -> None:

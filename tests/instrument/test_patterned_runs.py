@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import tifffile
 
+import diffuserbench as db
 from instrument.cli import main
 from instrument.files.calibration_file import save_calibration
 from instrument.files.errors import BenchError, FileError
@@ -18,7 +19,7 @@ from instrument.plan.illumination import illumination_plan
 from instrument.plan.model import load_plan
 from instrument.plan.patterns import group_lights, groups_from_text
 from instrument.reconstruction.options import InputOptions
-from instrument.reconstruction.patterned import PatternedRequest, prepare_patterned
+from instrument.reconstruction.patterned import PatternedRequest, forecast_patterned, prepare_patterned
 from recon import Calibration, Options
 from recon.base.metrics import psnr
 from tests.mocks.recordings import write_recording
@@ -114,6 +115,26 @@ def test_one_picture_of_all_patterns(
     assert record["provenance"]["patterns"] == 3
     assert record["inputs"]["dark"]["from"].startswith("the frames")
     assert "image" not in record["inputs"]
+
+
+def test_what_it_takes_is_told_with_its_patterns_in_terminal_and_python(
+    files: tuple[Path, Path, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run, sheet, calibration = files
+    lying = set(tmp_path.rglob("*"))
+    where = ["--patterned", str(sheet), "--calibration", str(calibration)]
+    assert main(["reconstruct", str(run), *where, "--explain", "--iterations", "4", "--tolerance", "0"]) == 0
+    assert "an iteration, 4 of them" in capsys.readouterr().out
+    assert set(tmp_path.rglob("*")) == lying
+    request = PatternedRequest(
+        run=run, sheet=sheet, calibration=calibration, options=Options(iterations=4, tolerance=0.0)
+    )
+    prepared = replace(prepare_patterned(request), seconds=1000.0)
+    told = forecast_patterned(prepared)
+    assert (told.settles, told.counted) == (4, True)
+    assert 1000 < told.seconds < 1600, "what the patterns took is in it"
+    told = db.forecast(run, calibration, patterned=sheet, iterations=4, tolerance=0.0)
+    assert told.settles == 4
 
 
 def test_a_colour_camera_in_patterned_light(files: tuple[Path, Path, Path], tmp_path: Path) -> None:
@@ -240,7 +261,6 @@ def test_saturated_frames_are_told(files: tuple[Path, Path, Path], tmp_path: Pat
         ["--psf", "x.tif"],
         ["--workers", "2"],
         ["--dark", "3"],
-        ["--explain"],
     ],
 )
 def test_options_that_do_not_apply_are_named(options: list[str], capsys: pytest.CaptureFixture[str]) -> None:
