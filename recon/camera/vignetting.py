@@ -50,8 +50,13 @@ def _terms(shape: tuple[int, int]) -> Floats:
     return np.stack([columns**2, rows**2, (columns**2 + rows**2) ** 2, columns, rows])
 
 
-def least_squares(left: Callable[[Floats], Floats], numbers: Floats) -> Floats:
-    """Return the numbers of least mean square and penalty, by Levenberg's steps from those given."""
+def least_squares(
+    left: Callable[[Floats], Floats], numbers: Floats, deepest: Callable[[Floats], bool]
+) -> Floats | None:
+    """Return the numbers of least mean square and penalty, by Levenberg's steps from those given.
+
+    None as soon as a step comes to a shade that is ``deepest``: it is none, however much it explains.
+    """
     firm, rest = FIRM, left(numbers)
     least = float(np.mean(rest**2)) + LEAST * float(numbers @ numbers)
     for _ in range(STEPS):
@@ -70,6 +75,8 @@ def least_squares(left: Callable[[Floats], Floats], numbers: Floats) -> Floats:
             break
         fallen, firm = 1 - misfit / least, max(firm / 10, FIRM / 10)
         numbers, rest, least = tried, after, misfit
+        if deepest(numbers):
+            return None
         if fallen < SETTLED or float(np.mean(rest**2)) < ENOUGH:
             break
     return numbers

@@ -301,6 +301,7 @@ def with_light_restored(problem: Problem, *, offset: bool = True) -> Problem:
         Whether an even offset may be what lacks: not where a smooth background which is light explains it.
     """
     options, measurement = problem.options, problem.measurement
+    found = measurement.found
     said = options.estimate_background is not None or measurement.background is not None
     said = said or (options.choose is not None and options.choose.background is not None)
     said = said or measurement.vignetting is not None
@@ -325,7 +326,7 @@ def with_light_restored(problem: Problem, *, offset: bool = True) -> Problem:
         shade = shade_of(numbers, problem.sensor_shape)
         return _restored(
             problem,
-            replace(measurement, vignetting=shade),
+            replace(measurement, vignetting=shade, found={**found, "shade": numbers.tolist()}),
             f"The photograph's light falls off (to {float(shade.min()):.0%} in its darkest corner), and its "
             "PSF's does not: it was divided by the fall-off that was fitted to it. As a rule a lens or an "
             "aperture casts the shade.",
@@ -336,7 +337,7 @@ def with_light_restored(problem: Problem, *, offset: bool = True) -> Problem:
     counts = share * small.mean
     return _restored(
         problem,
-        replace(measurement, background=-counts),
+        replace(measurement, background=-counts, found={**found, "added_counts": counts}),
         f"The photograph is darker than light through its PSF can be: {counts:.3g} counts ({share:.0%} of "
         "its mean) were added. As a rule too much was taken off as its dark level (--dark), or its light "
         "falls off as the PSF's does not.",
@@ -393,6 +394,8 @@ def _shade_of(small: _Small, given: Floats) -> Floats | None:
     if floor(small.channels[most].calibration.psfs, DARKEST_PERCENTILE) > PEDESTAL:
         return None
     numbers = _shade_fitted(small.channels[most], 1 + float(small.usual2[most]))
+    if numbers is None:
+        return None
 
     def left2(share: float) -> Floats:
         shade = shade_of(share * numbers, shape)
@@ -406,12 +409,13 @@ def _shade_of(small: _Small, given: Floats) -> Floats | None:
     share = _least(lambda share: small.lacks(left2(share), spared), 1.0, SHADE_HALVINGS)
     fallen = small.beyond(given) ** 0.5 - max(small.beyond(explained), 1.0) ** 0.5
     least = shade_of(share * numbers, shape).min()
-    is_told = least > np.float32(DEEPEST) and fallen > -TELLING * float(np.log(least))
-    return share * numbers if is_told else None
+    return share * numbers if fallen > -TELLING * float(np.log(least)) else None
 
 
-def _shade_fitted(channel: Problem, usual2: float) -> Floats:
+def _shade_fitted(channel: Problem, usual2: float) -> Floats | None:
     """Return the numbers of the shade through which a small copy's PSF explains it best (:func:`shade_of`).
+
+    None where it would be as deep as can be: so is what stray light is taken for.
 
     Parameters
     ----------
@@ -425,7 +429,10 @@ def _shade_fitted(channel: Problem, usual2: float) -> Floats:
         shade = shade_of(numbers, channel.sensor_shape)
         return _shade_left(channel, shade, SHADE_ITERATIONS).ravel() / float(usual2**0.5)
 
-    return least_squares(left, np.zeros(NUMBERS))
+    def is_deepest(numbers: Floats) -> bool:
+        return bool(shade_of(numbers, channel.sensor_shape).min() <= np.float32(DEEPEST))
+
+    return least_squares(left, np.zeros(NUMBERS), is_deepest)
 
 
 def _shade_left(channel: Problem, shade: npt.NDArray[np.float32], iterations: int) -> Floats:

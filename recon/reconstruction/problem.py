@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 
+from recon.base.blocks import block_mean
 from recon.base.checks import as_channels, check_psf
 from recon.base.declare import settled
 from recon.camera.camera_model import Depths, Extent, ModelName, choose_model, energies, levelled
@@ -448,6 +449,18 @@ class Problem:
     def _given(self) -> Measurement:
         """The measurement on the pixels and channels that were given."""
         return self.measurement if self.reduction is None else self.reduction.given.measurement
+
+    @property
+    def shade(self) -> Floats | None:
+        """Relative light on the data's pixels that they were divided by, (n_channels, height, width)."""
+        given = self._given
+        if given.vignetting is None or self.patterned:
+            return None
+        shade = given.like(given.vignetting, given.channels(), "vignetting")
+        if self.choice is not None and len(shade) > len(self.data):  # merged
+            shade = shade.mean(axis=0, keepdims=True)
+        factor = 1 if self.choice is None else self.choice.binning
+        return shade if factor == 1 else block_mean(shade, factor, about_axis=True)
 
     def provenance(self) -> Mapping[str, Any]:
         """Return what is known of it, JSON-compatible."""

@@ -108,10 +108,8 @@ def _chosen(problem: Problem, on_stage: Stage | None = None) -> tuple[Problem, C
     restored = with_light_restored(problem, offset=not is_light)
     if restored is problem:
         return problem, choice
-    before, added = choice, restored.measurement.background
+    added = restored.measurement.background
     choice = choice_for(restored, on_stage)
-    if added is None and before.background and choice.background:  # a shade that leaves stray light was that
-        return problem, before
     if added is None:
         return restored, choice
     why = f"an even offset of {-float(np.asarray(added)):.3g} counts is added instead"

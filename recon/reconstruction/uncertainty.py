@@ -250,6 +250,10 @@ class Replicas:
         rng = np.random.default_rng(0)
         for left, valid in zip(self._rest, problem.valid, strict=True):
             left[~valid] = rng.choice(left[valid], np.count_nonzero(~valid))
+        # Noise grows where a shade was divided by: what falls elsewhere is to grow there.
+        shade = problem.shade
+        self._grown = np.float32(1) if shade is None else 1 / shade
+        self._rest = self._rest / self._grown
 
     def close(self) -> None:
         """Remove what the parts kept on disk."""
@@ -335,7 +339,7 @@ class Replicas:
         turns = rng.choice([-1, 1], 3)
         by = [int(rng.integers(n)) for n in self._rest.shape[1:]]
         noise = turns[0] * np.roll(self._rest[:, :: turns[1], :: turns[2]], by, axis=(1, 2))
-        data = np.concatenate(seen) + self._background + noise
+        data = np.concatenate(seen) + self._background + noise * self._grown
         return np.where(self._problem.valid, data, 0).astype(np.float32)
 
 

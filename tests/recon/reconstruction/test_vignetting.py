@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+
 import numpy as np
 import numpy.typing as npt
 import pytest
@@ -18,6 +20,8 @@ from recon.reconstruction.measurement import Measurement
 from recon.reconstruction.options import ReconstructionOptions
 from recon.reconstruction.problem import Problem
 from recon.reconstruction.selection import choose, with_background
+from recon.reconstruction.solve import solve
+from recon.reconstruction.uncertainty import Replicas
 from recon.streams.live import LiveReconstructor
 from recon.types import Calibration
 
@@ -149,3 +153,38 @@ def test_a_shade_is_brightest_where_it_is_1_and_the_same_on_coarser_pixels() -> 
     fine, coarse = shade_of(numbers, (60, 80)), shade_of(numbers, (15, 20))
     assert fine.max() == 1
     np.testing.assert_allclose(block_mean(fine, 4), coarse, rtol=0.02)
+
+
+@measured
+def test_a_shade_and_stray_light_are_both_found(hand: tuple[Image, Image]) -> None:
+    photograph, psf = hand
+    lit = photograph * cos4(photograph.shape, 0.25) + np.float32(0.3 * photograph.mean())
+    chosen = choose(Problem.of(lit, psf))
+    assert chosen.smooth
+    assert 0.2 < np.min(np.asarray(chosen.measurement.vignetting)) < 0.9
+
+
+@measured
+def test_numbers_of_a_shade_are_recorded_and_make_it_again(hand: tuple[Image, Image]) -> None:
+    photograph, psf = hand
+    restored = with_light_restored(Problem.of(photograph * cos4(photograph.shape, 0.4), psf))
+    found = json.loads(json.dumps(restored.provenance()))["fitted_to_the_photograph"]
+    again = shade_of(np.array(found["shade"]), photograph.shape)
+    np.testing.assert_allclose(again, restored.measurement.vignetting, rtol=1e-5)
+
+
+def test_repetitions_have_more_noise_where_a_shade_was_divided_by() -> None:
+    scene = make_scene("dense-picture", size=48, photons=3000.0, seed=4)
+    shade = cos4(scene.measurement.shape[:2], 0.2)
+    problem = Problem.of(Measurement(scene.measurement * shade, vignetting=shade), scene.calibration)
+    chosen = choose(problem)
+    result = solve(chosen)
+    small = result.basis[1] if result.basis else result
+    replicas = Replicas(chosen, small)
+    nothing = np.zeros_like(small.volume)
+    rng = np.random.default_rng(0)
+    several = np.stack([replicas._photograph(nothing, rng) for _ in range(12)])
+    replicas.close()
+    spread = several.std(axis=0)[0]
+    dark, bright = shade < 0.4, shade > 0.8
+    assert spread[dark].mean() > 1.8 * spread[bright].mean()
