@@ -48,9 +48,9 @@ import numpy.typing as npt
 
 from benchmarks.display_learning import configuration
 from calibration_routines.display.display_io import DisplayBench, require_slm
-from calibration_routines.display.display_learning import photograph_looks
 from calibration_routines.display.hologram_photograph import HologramCamera
 from calibration_routines.display.mask_alignment import AlignmentReport
+from calibration_routines.display.pattern_series import photograph_series
 from calibration_routines.optics.angular_response import AngularResponse
 from calibration_routines.optics.bead_photographs import BeadSlides, photograph_slides
 from calibration_routines.optics.dpc import DiffuserSurface
@@ -237,13 +237,13 @@ def _displacement(done: Any) -> Array:
 
 
 @cache
-def _true_looks() -> list[Look]:
+def _true_looks() -> tuple[Look, ...]:
     """Return photographs of patterns that nobody learns from, on the bench without faults."""
     with open_bench(parse_config(_LEARNED, None)) as bench:
         slm, config = require_slm(bench), bench.config
         known = bench_display(config, (slm.shape, slm.pixel_pitch_um))
         seen = HologramCamera.registered(DisplayBench(bench, config.display.slm_binning), known)
-        return photograph_looks(seen, 3, seed=7)
+        return photograph_series(seen, 3, seed=7).looks
 
 
 def _left(done: Any) -> Array:
@@ -293,7 +293,7 @@ for _key, _value in {
     "shift_um": "[31.0, -42.0]",
 }.items():
     _DISPLAY = re.sub(rf"(?m)^{_key} = [^#\n]*", f"{_key} = {_value} ", _DISPLAY)
-_LEARNED = configuration("errors", expansion=4, seed=0)
+_LEARNED = configuration("errors", expansion=4, seed=0).replace("[slm]\n", "[slm]\nsettle_ms = 1000.0\n")
 _SPOTS = {"reach": 8.0, "depth_um": 100.0, "spots": 25, "refinements": 2, "section_pictures": 2}
 _SLIDE = 'scene = "beads"\nscene_distance_mm = 80.0\nbeads = 20\n'
 _NEAR = {"z_min_um": 60e3, "z_max_um": 150e3}

@@ -25,8 +25,9 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 import numpy as np
 
 from calibration_routines.display.display_io import DisplayBench, require_slm
-from calibration_routines.display.display_learning import ASIDE, photograph_looks
+from calibration_routines.display.display_learning import ASIDE
 from calibration_routines.display.hologram_photograph import HologramCamera
+from calibration_routines.display.pattern_series import photograph_series
 from instrument.bench.bench import open_bench
 from instrument.bench.config_file import parse_config
 from instrument.display.hologram import CaptureOptions, bench_display, prepare_target
@@ -112,7 +113,7 @@ def one_display(kind: str, options: argparse.Namespace, expansion: int) -> list[
         known = bench_display(config, (slm.shape, slm.pixel_pitch_um))
         io = DisplayBench(bench, config.display.slm_binning)
         seen = HologramCamera.registered(io, replace(known, displacement=np.zeros((*NODES, 2))))
-        looks = photograph_looks(seen, options.patterns, seed=options.seed)
+        looks = photograph_series(seen, options.patterns, seed=options.seed).looks
         photographs = io.frames
         learning = time.process_time()
         print(f"{head}: {photographs} photographs, {learning - began:.0f} CPU s; learning", flush=True)

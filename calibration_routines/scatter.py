@@ -197,9 +197,10 @@ class Scatter:
             found.append(self._other_light(what))
         if self.blur > TOLERATED:
             how = "frames were put" if put_back else "too smooth for its frames to be put"
+            how = "one frame each" if self.frames == 1 else f"{how} onto one another"
             found.append(
-                f"the picture shakes by {self.motion_px:.2f} pixels from frame to frame ({how} onto one "
-                f"another; the place of a {what} is known to {self.place_error_px:.2f} pixels): {_STILL}."
+                f"the picture shakes by {self.motion_px:.2f} pixels from frame to frame ({how}; the place of "
+                f"a {what} is known to {self.place_error_px:.2f} pixels): {_STILL}."
             )
         return tuple(found)
 

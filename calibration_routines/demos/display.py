@@ -20,7 +20,6 @@ from calibration_routines.display.display_learning import (
     ASIDE,
     learned_alignment,
     learning_lines,
-    photograph_looks,
 )
 from calibration_routines.display.hologram_photograph import (
     Capture,
@@ -30,6 +29,7 @@ from calibration_routines.display.hologram_photograph import (
 )
 from calibration_routines.display.mask_alignment import AlignmentReport, MaskAlignment, alignment_of
 from calibration_routines.display.mask_search import AlignmentSettings
+from calibration_routines.display.pattern_series import photograph_series
 from calibration_routines.procedure import Listener
 from instrument.bench.bench import Bench, open_bench
 from instrument.bench.config_file import parse_config
@@ -164,10 +164,10 @@ def run_display_demo(
         alignment = alignment_of(report, bench, nominal.mask.shape)
         listener.step("photographing random patterns")
         seen = HologramCamera.registered(io, alignment.of(nominal))
-        looks = photograph_looks(seen, settings.patterns)
+        series = photograph_series(seen, settings.patterns)
         listener.step("learning the display")
         lesson = learn_display(
-            seen.display, looks, aside=ASIDE, on_progress=lambda share, _: listener.share(share, 1.0)
+            seen.display, series.looks, aside=ASIDE, on_progress=lambda share, _: listener.share(share, 1.0)
         )
         seconds["learn"] = time.perf_counter() - began - seconds["align"]
         learned = learned_alignment(alignment, nominal, lesson, corrected=False)

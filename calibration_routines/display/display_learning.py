@@ -12,37 +12,26 @@ import numpy.typing as npt
 from calibration_routines.display.display_io import DisplayBench, bring_mask, require_slm, writable
 from calibration_routines.display.hologram_photograph import HologramCamera
 from calibration_routines.display.kept_frames import KeptFrames, SeenAgain, kept_words
+from calibration_routines.display.pattern_series import photograph_series, series_frames
 from calibration_routines.options import Checked
 from calibration_routines.procedure import Listener, Outcome, Outlook, Procedure
 from calibration_routines.routine import Routine
 from instrument.bench.bench import Bench
 from instrument.display.hologram import Alignment, bench_display, load_alignment, save_alignment
-from instrument.files.atomic import require_new
+from instrument.files.atomic import named_by_worth, require_new
+from instrument.files.record import plain
 from instrument.files.slm_image import load_slm_correction
 from instrument.runs.run_control import RunControl
 from recon.base.declare import option
 from recon.holography import Display
-from recon.holography.learn import Lesson, Look, learn_display
+from recon.holography.learn import Lesson, learn_display
 from recon.holography.pose import NODES, Pose
-from recon.holography.target import make_band
 
 DISPLAY_FILE = "display.json"
 """Where the command line writes it."""
 ASIDE = 3
 """Photographs that are not fitted but judge."""
-
-
-def photograph_looks(seen: HologramCamera, count: int, *, seed: int = 0) -> list[Look]:
-    """Show random phases and photograph each once; returns them with what was seen."""
-    rng = np.random.default_rng(seed)
-    band = make_band(seen.display.slm_shape, seen.display.factor, "alias-free")
-    looks = []
-    for _ in range(count):
-        slm = np.exp(1j * rng.uniform(0, 2 * np.pi, seen.display.slm_shape)).astype(np.complex64)
-        seen.io.show(slm)
-        frame = seen.io.photograph(seen.io.exposure_ms(seen.mean_per_ms))
-        looks.append(Look(slm, seen.camera.lags(frame, band)))
-    return looks
+_REGISTERING = 2  # frames: a dark one, and the blank SLM's
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -78,7 +67,7 @@ class LearningProcedure(SeenAgain, Checked, Procedure):
     @property
     def frames(self) -> int:
         """Frames it takes."""
-        return self.patterns + 2
+        return _REGISTERING + series_frames(self.patterns)
 
     def outlook(self, bench: Bench, folder: Path | None = None) -> Outlook:
         """Refuse a bench without SLM or with mirrors, files that cannot be read or do not fit or exist."""
@@ -125,22 +114,31 @@ class LearningProcedure(SeenAgain, Checked, Procedure):
                 place = _in_place(nominal, bench)
             listener.step("photographing random patterns")
             seen = HologramCamera.registered(io, place.of(nominal))
-            looks = photograph_looks(seen, self.patterns)
+            series = photograph_series(seen, self.patterns)
             bench.stop()
             kept.finish()
             listener.step("learning")  # who interrupts it is told how to see the frames again
-            lesson = learn_display(seen.display, looks, aside=ASIDE, on_progress=progress)
+            lesson = learn_display(seen.display, series.looks, aside=ASIDE, on_progress=progress)
         found = learned_alignment(place, nominal, lesson, corrected=self.slm_calibration is not None)
+        doubted = bool(series.findings)
+        out = named_by_worth(out, doubted=doubted, overwrite=self.overwrite)
         facts = {
             "bench": bench.label,
             "frames": io.frames,
+            "scatter": plain(series.scatter),
+            "visits": plain(list(series.visits)),
+            "findings": list(series.findings),
             "camera_residual_px": seen.camera.residual_px,
             "unexplained": {"before": lesson.before, "after": lesson.after, "rounds": list(lesson.rounds)},
         }
         save_alignment(out, found, facts)
         return Outcome(
-            verdict=tuple(learning_lines(lesson, io.frames, simulated=found.simulated)),
-            good=True,
+            verdict=(
+                *(f"Quality: {words}" for words in series.findings),
+                *learning_lines(lesson, io.frames, simulated=found.simulated),
+                *(f"  {words}" for words in series.notes),
+            ),
+            good=not doubted,
             runs=kept.paths,
             calibration=out,
             result=lesson,

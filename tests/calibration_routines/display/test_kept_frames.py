@@ -159,7 +159,9 @@ def test_frames_that_are_all_there_are_a_complete_run_whatever_becomes_of_the_le
 ) -> None:
     monkeypatch.setattr(display_learning, "learn_display", Mock(side_effect=InputError("too little")))
     monkeypatch.setattr(HologramCamera, "registered", lambda io, _: Mock(io=io))
-    monkeypatch.setattr(display_learning, "photograph_looks", lambda seen, _: [seen.io.photograph(10.0)])
+    monkeypatch.setattr(
+        display_learning, "photograph_series", lambda seen, _: Mock(looks=[seen.io.photograph(10.0)])
+    )
     learning = LearningProcedure(out=tmp_path / "d.json")
     with Bench(parse_config(small(), None)).open() as bench, pytest.raises(InputError) as ended:
         learning.carry_out(bench, tmp_path)

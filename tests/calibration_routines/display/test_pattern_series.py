@@ -1,0 +1,169 @@
+"""Photographs of random patterns, and what one of them tells that is shown again and again."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+from scipy.ndimage import zoom
+
+from calibration_routines.display import display_learning
+from calibration_routines.display.display_learning import LearningProcedure
+from calibration_routines.display.hologram_photograph import HologramCamera
+from calibration_routines.display.pattern_series import (
+    VISIT_FRAMES,
+    PatternSeries,
+    Visit,
+    photograph_series,
+    series_frames,
+    visited_before,
+)
+from calibration_routines.purpose import CalibrationError
+from calibration_routines.scatter import NO_CHANGE, STEADY, Scatter
+from instrument.bench.bench import Bench
+from instrument.bench.config_file import parse_config
+from recon.holography import Display, random_mask
+from recon.holography.camera_map import CameraMap
+from recon.holography.learn import Lesson
+from tests.calibration_routines.display.test_mask_alignment import small
+
+Array = npt.NDArray[Any]
+SHAPE, K, ACROSS, RIM = (24, 32), 2, 160, 8
+MASK = np.exp(1j * np.pi * np.random.default_rng(3).integers(0, 2, (SHAPE[0] * K, SHAPE[1] * K)))
+DISPLAY = Display(SHAPE, random_mask((SHAPE[0] * K, SHAPE[1] * K), seed=3), mask_fill=1.0)
+COUNT = 9
+
+
+class Io:
+    """Shows the mask's far field; what is wrong with it goes by how many patterns were shown."""
+
+    def __init__(self, wrong: Callable[[int, Array], Array], mask: Callable[[int], Array]) -> None:
+        self.frames, self._shown, self._wrong, self._mask = 0, 0, wrong, mask
+        self._slm: Array = np.ones(SHAPE)
+        self._noise = np.random.default_rng(8)
+
+    def exposure_ms(self, _: float) -> float:
+        return 10.0
+
+    def show(self, slm: Array) -> None:
+        self._slm = slm
+        self._shown += 1
+
+    def photograph(self, _: float) -> Array:
+        field = np.kron(self._slm, np.ones((K, K))) * self._mask(self._shown)
+        light = np.abs(np.fft.fftshift(np.fft.fft2(field, (ACROSS, ACROSS)))) ** 2
+        light = np.pad(self._wrong(self._shown, light / light.mean()), RIM, mode="wrap")
+        self.frames += 1
+        return light + 0.01 * self._noise.standard_normal(light.shape)
+
+
+def moved_by(light: Array, rows: float, columns: float) -> Array:
+    y, x = np.fft.fftfreq(ACROSS), np.fft.rfftfreq(ACROSS)
+    ramp = np.exp(-2j * np.pi * (rows * y[:, None] + columns * x))
+    return np.fft.irfft2(np.fft.rfft2(light) * ramp, light.shape)
+
+
+def series(
+    wrong: Callable[[int, Array], Array] = lambda _, light: light,
+    mask: Callable[[int], Array] = lambda _: MASK,
+) -> PatternSeries:
+    camera = CameraMap((ACROSS + 2 * RIM,) * 2, ACROSS, np.zeros((10, 2)))
+    seen = SimpleNamespace(io=Io(wrong, mask), display=DISPLAY, camera=camera, mean_per_ms=1.0)
+    return photograph_series(seen, COUNT)  # type: ignore[arg-type]
+
+
+def apart(one: PatternSeries, other: PatternSeries) -> float:
+    """Return by which part photographs differ at most, brightness and mean apart."""
+    parts = []
+    for look, known in zip(one.looks, other.looks, strict=True):
+        a, b = look.lags.copy(), known.lags.copy()
+        a[0, 0] = b[0, 0] = 0
+        a *= np.vdot(a, b).real / np.vdot(a, a).real
+        parts.append(float(np.linalg.norm(a - b) / np.linalg.norm(b)))
+    return max(parts)
+
+
+def test_the_first_pattern_is_visited_before_the_others_between_them_and_in_the_end() -> None:
+    assert visited_before(5) == [1, 5]
+    assert visited_before(9) == [1, 5, 9]
+    assert visited_before(13) == [1, 5, 9, 13]
+    still = series()
+    assert still.frames == series_frames(COUNT) == COUNT - 1 + 3 * VISIT_FRAMES
+    assert len(still.looks) == COUNT
+    assert (still.findings, still.notes, still.crept_px) == ((), (), 0.0)
+    assert still.other < 1e-3
+    assert still.scatter.averages == 3
+
+
+def test_a_picture_that_creeps_is_put_back_and_that_is_said() -> None:
+    still = series()
+    crept = series(lambda shown, light: moved_by(light, 0.1 * shown, -0.05 * shown))
+    assert crept.crept_px == pytest.approx((COUNT + 1) * np.hypot(0.1, 0.05), rel=0.05)
+    assert "put back" in " ".join(crept.notes)
+    assert crept.findings == ()
+    assert apart(crept, still) < 0.1
+
+
+def test_what_shakes_is_a_finding_and_flicker_is_none() -> None:
+    rng = np.random.default_rng(2)
+    shaken = series(lambda _, light: moved_by(light, *rng.normal(0, 0.5, 2)))
+    (words,) = shaken.findings
+    assert "shakes by 0." in words
+    assert "one frame each" in words
+    flickering = series(lambda _, light: light * (1 + 0.2 * rng.standard_normal()))
+    assert flickering.findings == ()
+    assert "flickers by 2" in " ".join(flickering.notes)
+
+
+def test_a_picture_that_grows_is_a_finding() -> None:
+    def grown(shown: int, light: Array) -> Array:
+        if shown < 8:
+            return light
+        large = zoom(light, 1.0125, order=3)
+        edge = (len(large) - ACROSS) // 2
+        return np.asarray(large[edge : edge + ACROSS, edge : edge + ACROSS])
+
+    assert "larger: camera or lens moved" in " ".join(series(grown).findings)
+
+
+def test_a_mask_that_moves_against_the_slm_is_a_finding_or_the_end() -> None:
+    aside = np.roll(MASK, 1, axis=1)
+    with pytest.raises(CalibrationError, match="did not give its picture again"):
+        series(mask=lambda shown: MASK if shown < 8 else aside)
+    a_little = series(mask=lambda shown: MASK if shown < 8 else MASK + 0.25 * aside)
+    assert "became another one" in " ".join(a_little.findings)
+
+
+def test_what_is_learned_of_a_picture_that_shook_is_doubtful_and_says_so(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def learned(name: str, scatter: Scatter) -> tuple[bool, Path, str]:
+        photographed = PatternSeries((), 9, (Visit(NO_CHANGE), Visit(NO_CHANGE)), scatter)
+        monkeypatch.setattr(display_learning, "photograph_series", lambda *_: photographed)
+        with Bench(parse_config(small(), None)).open() as bench:
+            done = LearningProcedure(out=tmp_path / name).carry_out(bench, tmp_path)
+        assert done.calibration is not None
+        return done.good, done.calibration, " ".join(done.verdict)
+
+    def registered(io: Any, display: Display) -> Any:
+        return SimpleNamespace(io=io, display=display, camera=SimpleNamespace(residual_px=0.1))
+
+    monkeypatch.setattr(HologramCamera, "registered", registered)
+    monkeypatch.setattr(
+        display_learning,
+        "learn_display",
+        lambda display, *_, **__: Lesson(display, 0.5, 0.5, (), False),
+    )
+    good, file, words = learned("a.json", STEADY)
+    assert (good, file.name, "Quality" in words) == (True, "a.json", False)
+    good, file, words = learned("b.json", Scatter(3, motion_px=0.9))
+    assert (good, file.name) == (False, "doubtful_b.json")
+    assert "Quality: the picture shakes by 0.90 pixels" in words
+    assert not (tmp_path / "b.json").exists()
+    assert "shakes" in json.loads(file.read_text())["findings"][0]
