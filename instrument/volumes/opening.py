@@ -59,7 +59,8 @@ def _open_zarr(path: Path) -> VolumeSource:
     except Exception as error:
         raise FileError(path, f"is no OME-Zarr 0.5 image: {error!r:.200}.") from error
     if names not in (["z", "y", "x"], ["c", "z", "y", "x"]):
-        raise FileError(path, f"has the axes {', '.join(map(str, names))}; a volume has z, y, x, or c before them.")
+        found = ", ".join(map(str, names))
+        raise FileError(path, f"has the axes {found}; a volume has z, y, x, or c before them.")
 
     def reader(array: Any) -> Callable[[Any, Any, Any], npt.NDArray[Any]]:
         if len(names) == 3:
