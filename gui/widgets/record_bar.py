@@ -26,6 +26,8 @@ if TYPE_CHECKING:
     from instrument.runs.run import Run
 
 _DISK_MS = 5000
+_LEFT = "recordings left as they are"
+"""What is kept with the bench of those whose rest is offered no longer, by the names of their folders."""
 _SILENT_S = 4.0
 """A disk that takes longer is called silent."""
 
@@ -67,13 +69,16 @@ class RecordBar(QWidget):
         self.look_button.hide()
         self.rest_button = button("Go on with it", clicked=self._go_on)
         self.rest_button.hide()
+        tip = "Offer it no longer: what was taken is kept as it is"
+        self.leave_button = button("Leave it", tip, self._leave)
+        self.leave_button.hide()
         self.rest: RecordingRest | None = None
         """What a recording lacks that was cut, now or on an earlier day."""
         self._before: tuple[Path | None, str] = (None, "")
         """What was taken, and said of it, before the recording that runs."""
         self._rests = NewestOnly(panel.jobs, "Looking for a recording that was cut")
         parts = (self.button, self.seconds, self.label, self.gauge, (self.note, 1))
-        fill(self, *parts, self.rest_button, self.look_button, across=True)
+        fill(self, *parts, self.rest_button, self.leave_button, self.look_button, across=True)
         every(self, _DISK_MS, self._look_at_disk)
         self._look_at_disk()
         self._look_for_rest()
@@ -135,7 +140,7 @@ class RecordBar(QWidget):
         self._rests.forget()
         self.note.clear()
         self.look_button.hide()
-        self.rest_button.hide()
+        self._show_rest(False)
         self.button.setText("■ End")
         job.progressed.connect(self._show)
         job.succeeded.connect(self._done)
@@ -170,7 +175,7 @@ class RecordBar(QWidget):
         if self._taken is None:
             self._taken, said = self._before
             self.note.setText(said)
-            self.rest_button.setVisible(self.rest is not None)
+            self._show_rest(self.rest is not None)
             return
         kept = self.note.text().partition(" · ")[0] or "no frame yet"
         self.note.setText(f"Ended {how} ({kept}); what was taken is kept in {self._taken.name}")
@@ -197,7 +202,7 @@ class RecordBar(QWidget):
             self._look_for_rest()
 
     def _offer_rest(self, rest: RecordingRest | None) -> None:
-        if rest is None or self.job is not None:
+        if rest is None or self.job is not None or rest.run.name in self._session.kept.of(_LEFT):
             return
         self.rest = rest
         lacks = [duration(rest.seconds)] if rest.seconds is not None else []
@@ -206,11 +211,24 @@ class RecordBar(QWidget):
             f"Record the {' or '.join(lacks)} that it lacks, in its light and settings, as a film of its own"
         )
         self.rest_button.setToolTip(tip)
-        self.rest_button.show()
+        self._show_rest(True)
         if self._taken is None:  # of an earlier day
             self._taken = rest.run
             self.note.setText(f"{rest.run.name} did not end: {count(rest.stored, 'frame')} kept")
             self.look_button.show()
+
+    def _show_rest(self, offered: bool) -> None:
+        self.rest_button.setVisible(offered)
+        self.leave_button.setVisible(offered)
+
+    def _leave(self) -> None:
+        """Offer the rest no longer, on no other day either."""
+        rest, self.rest = self.rest, None
+        self._show_rest(False)
+        self.button.setFocus()  # else the keyboard would be nowhere
+        if rest is not None:
+            self._session.keep(_LEFT, rest.run.name, True)
+            self.note.setText(f"{rest.run.name}: {count(rest.stored, 'frame')} kept")
 
     def _look_at_it(self) -> None:
         self._session.handed_on.emit("runs", self._taken)

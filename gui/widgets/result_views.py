@@ -24,9 +24,13 @@ from gui.widgets.plots import LevelsBar, curve_pen, legend, plot_widget
 from instrument.files.orientation import AS_IT_IS, Orientation
 from recon.solvers.base import IterationRecord
 
+_GAP_PX = 10
+_MOST_OF_NAMES = 0.4
+"""Of the width of facts: where names would take more, they stand above their values."""
+
 
 class FactsView(QTextBrowser):
-    """Names and values, warnings in plain words above them."""
+    """Names and values, warnings in plain words above them; a narrow one has each name above its value."""
 
     def __init__(self, parent: QWidget | None = None) -> None:
         super().__init__(parent)
@@ -36,6 +40,8 @@ class FactsView(QTextBrowser):
         self.setAccessibleName("Facts about the result")
         self.setToolTip("What is known of the result: the verdict, how it was made; can be copied")
         self._shown: tuple[Sequence[tuple[str, str]], Sequence[str], bool] = ((), (), False)
+        self._stacked = False
+        """Whether each name stands above its value."""
 
     def restyle(self) -> None:
         """Take over the colours of the theme in use."""
@@ -52,12 +58,24 @@ class FactsView(QTextBrowser):
         if simulated:
             parts.append(f'<p style="color:{now.warning}"><b>SIMULATED</b></p>')
         parts += [f'<p style="color:{now.warning}">Warning: {escape(text)}</p>' for text in warnings]
+        self._stacked = self._is_narrow()
+        name_style = f'style="color:{now.dim};padding-right:{_GAP_PX}px"'
+        between = "</td></tr><tr><td>" if self._stacked else "</td><td>"
         rows = "".join(
-            f'<tr><td style="color:{now.dim};padding-right:10px">{escape(name)}</td>'
-            f"<td>{escape(value)}</td></tr>"
-            for name, value in facts
+            f"<tr><td {name_style}>{escape(name)}{between}{escape(value)}</td></tr>" for name, value in facts
         )
         self.setHtml("".join([*parts, f"<table>{rows}</table>" if rows else ""]))
+
+    def resizeEvent(self, event: QResizeEvent) -> None:  # noqa: N802 - Qt's name
+        """Put names beside or above their values, as there is room."""
+        super().resizeEvent(event)
+        if self._stacked != self._is_narrow():
+            self.restyle()
+
+    def _is_narrow(self) -> bool:
+        """Whether names beside their values would take too much of the width."""
+        names_px = max((self.fontMetrics().horizontalAdvance(name) for name, _ in self._shown[0]), default=0)
+        return names_px + _GAP_PX > _MOST_OF_NAMES * self.viewport().width()
 
 
 class PictureView(QWidget):

@@ -534,9 +534,8 @@ def test_a_recording_that_was_stopped_is_kept_in_the_dark_and_goes_on_in_its_lig
     assert bar.rest_button.isHidden(), "it has been gone on with"
 
 
-def test_a_recording_that_a_kill_cut_is_offered_when_the_program_starts_anew(
-    qtbot: QtBot, session: BenchSession
-) -> None:
+def _cut(session: BenchSession) -> Path:
+    """Record a film that a kill cuts; return its folder."""
     bench = session.bench
     bench.scene_on()
 
@@ -549,10 +548,40 @@ def test_a_recording_that_a_kill_cut_is_offered_when_the_program_starts_anew(
     state = cut / "state.json"
     state.write_text(state.read_text().replace('"finished"', '"running"'))
     assert Run.open(cut).condition is RunCondition.CRASHED
+    return cut
+
+
+def _shown_live(qtbot: QtBot, session: BenchSession) -> LivePanel:
     live = whole(LivePanel(session))
     qtbot.addWidget(live, before_close_func=lambda p: p.shutdown())
     live.show()
-    bar = live.record_bar
+    return live
+
+
+def test_the_rest_of_a_recording_may_be_left_and_is_offered_no_more(
+    qtbot: QtBot, session: BenchSession
+) -> None:
+    cut = _cut(session)
+    bar = _shown_live(qtbot, session).record_bar
+    qtbot.waitUntil(bar.leave_button.isVisible, timeout=WAIT_MS)
+    qtbot.mouseClick(bar.leave_button, Qt.MouseButton.LeftButton)
+    assert bar.leave_button.isHidden()
+    assert bar.rest_button.isHidden()
+    assert bar.look_button.isVisible()
+    assert bar.note.text().startswith(f"{cut.name}: ")
+    kept = session.runs_folder / "kept-with-bench.json"
+    qtbot.waitUntil(lambda: kept.exists() and cut.name in kept.read_text(), timeout=WAIT_MS)
+    again = _shown_live(qtbot, session).record_bar
+    qtbot.waitUntil(lambda: not again._rests.is_reading, timeout=WAIT_MS)
+    assert again.rest_button.isHidden()
+    assert Run.open(cut).condition is RunCondition.CRASHED, "as it was"
+
+
+def test_a_recording_that_a_kill_cut_is_offered_when_the_program_starts_anew(
+    qtbot: QtBot, session: BenchSession
+) -> None:
+    cut, bench = _cut(session), session.bench
+    bar = _shown_live(qtbot, session).record_bar
     qtbot.waitUntil(bar.rest_button.isVisible, timeout=WAIT_MS)
     assert bar.note.text().startswith(f"{cut.name} did not end: ")
     assert bar.look_button.isVisible()

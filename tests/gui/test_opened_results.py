@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import tifffile
 from PySide6.QtCore import Qt
+from PySide6.QtGui import QTextTable
 from PySide6.QtWidgets import QApplication, QFileDialog
 from pytestqt.qtbot import QtBot
 
@@ -18,6 +19,7 @@ from gui.panels.reconstructions import ReconstructionsPanel
 from gui.theme import TURN, apply_theme, change_theme
 from gui.widgets.dialogues import Question
 from gui.widgets.entry import Refusing
+from gui.widgets.result_views import FactsView
 from instrument.files.images import read_image, write_image
 from instrument.reconstruction.stored_result import open_result
 from instrument.volumes.source import VolumeSource
@@ -236,3 +238,23 @@ def test_a_slice_ends_where_a_part_says_so(monkeypatch: pytest.MonkeyPatch) -> N
     parts = iter((None, TURN, None))
     making.take_slice(parts)
     assert list(parts) == [None]
+
+
+def test_facts_stand_below_their_names_where_these_leave_no_room(qtbot: QtBot) -> None:
+    view = FactsView()
+    qtbot.addWidget(view)
+    view.resize(600, 200)
+    view.show()
+    view.show_facts([("Seen (computed) at 40 mm", "PSNR 21.3 dB"), ("Light", "12 % reaches the field")])
+
+    def columns() -> int:
+        (table,) = view.document().rootFrame().childFrames()
+        assert isinstance(table, QTextTable)
+        return table.columns()
+
+    assert columns() == 2
+    view.resize(260, 200)
+    qtbot.waitUntil(lambda: columns() == 1)
+    assert "Seen (computed) at 40 mm\nPSNR 21.3 dB" in view.toPlainText()
+    view.resize(600, 200)
+    qtbot.waitUntil(lambda: columns() == 2)
