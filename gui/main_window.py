@@ -216,6 +216,7 @@ class MainWindow(QMainWindow):
         self.menus.setSizePolicy(QSizePolicy.Policy.Maximum, QSizePolicy.Policy.Fixed)
         self.simulated = label("SIMULATED")
         self.simulated.setObjectName("simulated")
+        self.simulated.setSizePolicy(QSizePolicy.Policy.Maximum, QSizePolicy.Policy.Fixed)
         self.simulated.setToolTip("Some or all devices of this bench have no hardware behind them")
         self.chips = DeviceChips(self.session)
         tip = "Halt all motion, turn the light off, end what runs (Esc)"

@@ -406,7 +406,8 @@ QProgressBar {{ background: {c.field}; color: {c.text}; border: 1px solid {c.lin
   text-align: center; }}
 QProgressBar::chunk {{ background: {c.primary}; border-radius: 3px; }}
 QHeaderView::section {{ background: {c.panel}; color: {c.dim}; border: none;
-  border-bottom: 1px solid {c.line}; padding: 3px 6px; }}
+  border-bottom: 1px solid {c.line}; padding: 3px; }}
+QHeaderView {{ background: {c.panel}; }}
 QScrollBar:vertical {{ background: {c.window}; width: 10px; }}
 QScrollBar:horizontal {{ background: {c.window}; height: 10px; }}
 QScrollBar::handle {{ background: {c.border}; border-radius: 4px; min-height: 24px; min-width: 24px; }}

@@ -38,7 +38,7 @@ _NO_PATH, _NO_FOLDER = r"(?<![/\\\w])", r"(?![^()]*\)[/\\])"
 """Neither in a folder nor the name of one: a file is found by its name as it is."""
 _SIGNS = (
     (re.compile(r"(?<=\d) um\b(?![/\\])"), " µm"),
-    (re.compile(r"\bin um\b(?![/\\])"), "in µm"),
+    (re.compile(r"(?:\bin|,) um\b(?![/\\])"), lambda found: found[0].replace("um", "µm")),
     (re.compile(r"\+-(?=[ \d])"), "±"),
     (re.compile(rf"{_NO_PATH}led_array(?= opened|:| \({_NO_FOLDER})"), "LED array"),
     (re.compile(rf"{_NO_PATH}slm(?= \({_NO_FOLDER})"), "SLM"),
@@ -64,6 +64,15 @@ def level_of(text: str) -> tuple[Literal["info", "warning"], str]:
     if colon and word in ("Note", "Warning"):
         return ("info" if word == "Note" else "warning"), rest[:1].upper() + rest[1:]
     return "warning", text
+
+
+def in_two_lines(words: str) -> str:
+    """Return words on two lines as alike in length as their spaces allow: for the head of a column."""
+    gaps = [place for place, letter in enumerate(words) if letter == " "]
+    if not gaps:
+        return words
+    gap = min(gaps, key=lambda place: abs(2 * place - len(words)))
+    return f"{words[:gap]}\n{words[gap + 1 :]}"
 
 
 def with_signs(text: str) -> str:

@@ -80,7 +80,7 @@ class ReconstructionsPanel(Panel):
         below = split()
         right = split(top, below, sizes=[520, 170], down=True, stretch=1)
         right.setStretchFactor(0, 3)
-        fill(self.body, split(self.tabs, right, sizes=[330, 840], stretch=1))
+        fill(self.body, split(self.tabs, right, sizes=[380, 840], stretch=1))
         yield
         self.list = QListWidget()
         self.list.setAccessibleName("Reconstructions")

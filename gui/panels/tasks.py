@@ -8,9 +8,9 @@ from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple, get_args
 
-from PySide6.QtCore import Qt, QUrl
+from PySide6.QtCore import Qt, QTimer, QUrl
 from PySide6.QtGui import QDesktopServices, QFontDatabase, QImage, QPixmap
-from PySide6.QtWidgets import QListWidget, QListWidgetItem, QVBoxLayout, QWidget
+from PySide6.QtWidgets import QListWidget, QListWidgetItem, QTableWidget, QVBoxLayout, QWidget
 
 from calibration_routines.psf.sweep_plan import SWEEP
 from gui.background import NewestOnly
@@ -40,7 +40,7 @@ from gui.widgets.building import (
 from gui.widgets.orientation import orientation_of, read_turned
 from gui.widgets.sweep_views import Picture
 from gui.widgets.tab_order import tab_in_order
-from gui.words import in_the_window, level_of, with_signs
+from gui.words import in_the_window, in_two_lines, level_of, with_signs
 from instrument.files.calibration_file import newest_calibration
 from instrument.files.orientation import Kind
 from instrument.tasks import CHARTS, TASKS, VIDEOS
@@ -53,6 +53,7 @@ _FILMS = ("run", "video")
 """Options that name what a calibration is needed for."""
 _PICTURES = (".png", ".jpg", ".svg")
 _ROW_PX = 26
+_LEAST_FORM_PX = 300
 _CALIBRATION = "calibration"
 
 
@@ -79,6 +80,8 @@ class TasksPanel(Panel):
         self._newest = NewestOnly(session.jobs, "Looking for the newest calibration")
         self._given: dict[str, Path] = {}
         self.files: tuple[Path, ...] = ()
+        self._lent_px = 0
+        """Width that the form has lent to a table."""
 
     def parts(self) -> Iterator[None]:
         """Make the widgets."""
@@ -98,7 +101,8 @@ class TasksPanel(Panel):
         yield
         results = self._make_results()
         yield
-        fill(self.body, split(left, results, sizes=[430, 800], stretch=1, firm=True))
+        self._across = split(left, results, sizes=[430, 800], stretch=1, firm=True)
+        fill(self.body, self._across)
         self.choice.currentIndexChanged.connect(self._chosen)
         self.run_bar.start.connect(self.start)
         self.run.told.connect(self._told)
@@ -205,13 +209,13 @@ class TasksPanel(Panel):
         if self._given:
             page.form.set_values(self._given)
             self._given = {}
-            self._look_for_calibration(name)
         if not self.run.is_running:
             if name != self._running:  # what another task found is not this one's
                 self._clear()
                 self._running = name
             self.run_bar.clear()
             self.run_bar.set_startable()
+        self._look_for_calibration(name)  # what it says of that stays
 
     def _made(self, name: str) -> None:
         """Fill in what a form begins with, once it is whole."""
@@ -231,7 +235,6 @@ class TasksPanel(Panel):
             form.set_values({"out": None})
             names.suggest(place.name.partition(".")[0])
         self._pages[name] = _Page(task, form, names)
-        self._look_for_calibration(name)
 
     def _settled(self, name: str, field: str) -> None:
         if field in _FILMS and name in self._pages:
@@ -334,6 +337,7 @@ class TasksPanel(Panel):
             if (widget := item.widget()) is not None:
                 widget.deleteLater()
         self.tables.hide()
+        self._take_back()
         self.picture.clear()
         self.list.clear()
         self.files = ()
@@ -344,7 +348,9 @@ class TasksPanel(Panel):
     def _told(self, told: Told) -> None:
         text = self._pages[self._running].form.in_its_words(in_the_window(told.text))
         if told.kind == "table":
-            made = table([with_signs(heading) for heading in told.headings], text, row_px=_ROW_PX)
+            made = table(
+                [in_two_lines(with_signs(heading)) for heading in told.headings], text, row_px=_ROW_PX
+            )
             made.setRowCount(len(told.rows))
             for row, texts in enumerate(told.rows):
                 for column, shown in enumerate(texts):
@@ -353,6 +359,7 @@ class TasksPanel(Panel):
             self._tables.addWidget(made)
             self.tables.show()
             self.words.setVisible(bool(self.words.toPlainText()))
+            QTimer.singleShot(0, self, self._lend)  # once it has its place
             return
         if told.kind == "warn":
             level, said = level_of(text)
@@ -360,6 +367,21 @@ class TasksPanel(Panel):
             text = f"⚠ {said}" if level == "warning" else text
         self.words.appendPlainText(text)
         self.words.show()
+
+    def _lend(self) -> None:
+        """Give the tables what they lack of the form's width, until something else is shown."""
+        shown = self.tables.findChildren(QTableWidget)
+        lacking = max((t.horizontalHeader().length() - t.viewport().width() for t in shown), default=0)
+        form, results = self._across.sizes()
+        if (more := min(lacking, form - _LEAST_FORM_PX)) > 0:
+            self._lent_px += more
+            self._across.setSizes([form - more, results + more])
+
+    def _take_back(self) -> None:
+        lent, self._lent_px = self._lent_px, 0
+        if lent:
+            form, results = self._across.sizes()
+            self._across.setSizes([form + lent, results - lent])
 
     def _succeeded(self, done: Done) -> None:
         self.files = done.files

@@ -142,7 +142,7 @@ class InputOptions:
     binning: int | None = option(
         None,
         help="Average N x N pixels.",
-        default_words="auto, at most 0.5 megapixel",
+        default_words="auto, up to 0.5 megapixel",
         none_word="auto",
         least=1,
         flags=("--bin",),

@@ -136,16 +136,23 @@ def etendue(desk: Desk, options: EtendueOptions) -> Done:
         lines.append(
             (
                 f"{q:g}",
-                f"{x.mask_pitch_um:.2f} um",
-                f"{x.field_of_view_deg:.1f} deg square",
-                f"{x.eyebox_mm:.2f} x {y.eyebox_mm:.2f} mm",
-                f"{pixels_per_degree(x, y):.0f} px/deg",
-                f"{x.etendue_mm:.3f} mm",
+                f"{x.mask_pitch_um:.2f}",
+                f"{x.field_of_view_deg:.1f}",
+                f"{x.eyebox_mm:.2f} x {y.eyebox_mm:.2f}",
+                f"{pixels_per_degree(x, y):.0f}",
+                f"{x.etendue_mm:.3f}",
             )
         )
-    headings = ("expansion q", "mask pixel", "field of view", "eyebox", "resolution", "étendue (width)")
+    headings = (
+        "expansion",
+        "mask pixel, um",
+        "field of view, deg",
+        "eyebox, mm",
+        "resolution, px/deg",
+        "étendue, mm",
+    )
     title = f"{width} x {height} pixels of {options.pitch_um:g} um at {nm:g} nm"
-    desk.table(headings, lines, title)
+    desk.table(headings, lines, f"{title}; the field is square, the étendue is of the width")
     for q in expansions:
         x = options.along(width, q)
         if fov is not None:

@@ -182,7 +182,7 @@ class ReconstructionOptions:
     iterations: int | None = option(
         None,
         help="At most so many iterations.",
-        default_words="200, or none with a time limit",
+        default_words="200, none with a time",
         least=1,
         flags=("--iterations", "-n"),
         metavar="N",

@@ -13,7 +13,7 @@ import pytest
 from PIL import Image
 from PySide6.QtCore import Qt
 from PySide6.QtGui import QImage
-from PySide6.QtWidgets import QWidget
+from PySide6.QtWidgets import QTableWidget, QWidget
 from pytestqt.qtbot import QtBot
 
 from gui.jobs import JobCancelledError
@@ -312,3 +312,20 @@ def test_a_task_waits_ends_and_keeps_what_it_can(qtbot: QtBot, panel: TasksPanel
         run.pause()  # of what is ended: it does not wait
     assert not panel.words.property("refused"), "a deliberate end is no error"
     assert issubclass(JobCancelledError, KeyboardInterrupt)  # what a task in the terminal sees
+
+
+def test_the_field_of_view_is_told_in_a_table_that_fits_a_small_screen(
+    qtbot: QtBot, panel: TasksPanel
+) -> None:
+    panel.resize(SIZES["1366x768"].width() - 480, 600)  # beside the live reconstruction
+    panel.show()
+    shown(qtbot, panel, "etendue")
+    with qtbot.waitSignal(panel.run.over, timeout=WAIT_MS):
+        panel.start()
+    (table,) = panel.tables.findChildren(QTableWidget)
+    assert table.columnCount() == 6
+    form_px = panel.stack.width()
+    qtbot.waitUntil(lambda: table.isVisible() and not table.horizontalScrollBar().maximum(), timeout=5000)
+    assert panel.stack.width() < form_px
+    shown(qtbot, panel, "spots")
+    assert panel.stack.width() == form_px, "it was lent until something else is shown"

@@ -12,7 +12,7 @@ import pytest
 
 import instrument
 from gui.session_news import LogBridge
-from gui.words import in_the_log, in_the_window, level_of
+from gui.words import in_the_log, in_the_window, in_two_lines, level_of
 
 ROOT = Path(instrument.__file__).parents[1]
 _IN_WINDOW = ("recon", "instrument", "calibration_routines")
@@ -111,3 +111,8 @@ def test_a_warning_of_a_command_says_no_word_that_the_log_says() -> None:
     assert level_of("Warning: frames move.") == ("warning", "Frames move.")
     assert level_of("Note: 3 depths are few.") == ("info", "3 depths are few.")
     assert level_of("one.tif: 3 frames are damaged") == ("warning", "one.tif: 3 frames are damaged")
+
+
+def test_heads_of_columns_stand_on_two_lines() -> None:
+    assert in_two_lines("field of view, deg") == "field of\nview, deg"
+    assert in_two_lines("expansion") == "expansion"
