@@ -345,6 +345,8 @@ def _is_explained(check: CalibrationCheck, problem: Problem) -> bool:
     if problem.smooth or not check.scores:
         return not problem.smooth
     small = _small(problem, QUICK[0])
+    if small.pixels != check.pixels:  # both in units of the noise, which larger pixels have less of
+        small = _small(problem, THOROUGH[0])
     seen = small.seen(background=False)
     contrast = float(np.std(seen.data[seen.valid], dtype=np.float64))
     beyond = max(as_given(check.scores).misfit - 1, 0.0)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import numpy.typing as npt
@@ -413,3 +414,20 @@ def test_a_volume_is_offered_what_straightens_its_files(
     assert cause is not None
     assert "the photograph is gamma-coded" in cause[0]
     assert "--srgb photograph" in cause[1]
+
+
+@pytest.mark.parametrize(("pixels", "explained"), [(100, True), (160, False)])
+def test_what_is_left_is_held_against_the_contrast_of_the_same_pixels(
+    seen: tuple[Image, Image], monkeypatch: pytest.MonkeyPatch, pixels: int, explained: bool
+) -> None:
+    """Larger pixels have less noise, so that the same contrast is more of it there."""
+
+    def small(_: Problem, longest_px: int) -> SimpleNamespace:
+        data = np.array([1.0, -1.0]) * (10.0 if longest_px == 100 else 5.0)
+        of_it = SimpleNamespace(data=data, valid=np.ones(2, bool))
+        return SimpleNamespace(pixels=longest_px, seen=lambda background: of_it)
+
+    monkeypatch.setattr(decoys, "_small", small)
+    left = Score(1.25, 1.0, (1.0,), (1.0,))  # half of the noise beyond it: 5 % of a contrast of 10, 10 % of 5
+    check = CalibrationCheck(Fit.FITS, {GIVEN: left}, pixels)
+    assert decoys._is_explained(check, Problem.of(*seen)) is explained
