@@ -4,7 +4,8 @@ Patterns scaled onto one another lose their likeness with their distance ``D`` i
 ``c(D) = t (b + (1 - b) / (1 + (D / D0)^p))``: noise leaves ``t``, what all patterns have in common ``b``.
 Two planes ``h`` apart, mixed as ``v a + w b``, agree with the pattern between them to
 ``(v c(D_a) + w c(D_b)) / sqrt(v^2 + w^2 + 2 v w c(h))``. Few planes do not tell all of the law: whatever
-agrees with the calibrated pairs counts, and the answer is a range.
+agrees with the calibrated pairs counts, and the answer is a range. A pattern between planes follows the law
+no better than calibrated pairs are asked to: the range is as much wider.
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ Floats = npt.NDArray[np.float64]
 _POWERS = (1.0, 1.5, 2.0)
 """Lenslets' patterns lose their likeness by about the first, smooth diffusers' by the second."""
 _SCALES, _COMMON = 40, 21  # steps of D0 and of b
-_KNOWN, _OF_LOST = 0.002, 0.1  # a pair's likeness agrees with the law to that, and that part of what is lost
+_KNOWN, _OF_LOST = 0.002, 0.1  # likenesses agree with the law to that, and that part of what is lost
 
 
 def likeness_range(
@@ -51,4 +52,6 @@ def likeness_range(
         mixed = (weights**2).sum() + 2 * weights[0] * weights[1] * (kept * law(gap))[..., 0]
         agreed = agreed / np.sqrt(mixed)
     possible = agreed[misfit <= max(misfit.min() + 1, 2 * misfit.min())]
-    return float(np.clip(possible.min(), 0, 1)), float(np.clip(possible.max(), 0, 1))
+    low, high = float(possible.min()), float(possible.max())
+    loose = _KNOWN + _OF_LOST * (1 - (low + high) / 2) if len(weights) > 1 else 0.0
+    return max(low - loose, 0.0), min(high + loose, 1.0)
