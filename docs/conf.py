@@ -40,7 +40,7 @@ CHAPTERS = {
     "Subjects": ("*",),
     "Reference": ("reference/*",),
     "Measured": ("benchmarks/*",),
-    "Decisions": ("decisions/*",),
+    "Decisions": ("decisions/README", "decisions/*"),
 }
 
 
@@ -99,8 +99,8 @@ def on_source(app: Any, docname: str, source: list[str]) -> None:
     if docname.startswith("tutorials/"):
         folder = Path(app.srcdir)
         source[0] = with_outputs(source[0], folder / f"{docname}.ipynb", folder / "_tutorials")
-    if docname == root_doc:  # a site shows no folder
-        source[0] = source[0].replace("](decisions/)", "](decisions/0001-dependencies.md)") + contents()
+    if docname == root_doc:
+        source[0] += contents()
     if docname == "reference/python":
         source[0] = source[0].replace("<!-- names -->", names())
 

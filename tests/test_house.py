@@ -157,6 +157,33 @@ def test_every_link_between_pages_leads_somewhere() -> None:
     assert lost == []
 
 
+DECISIONS = ROOT / "docs" / "decisions"
+HOLD = re.compile(r"\* \[(\d{4})\]\((\S+)\) (?:~~)?(.*?)(?:~~)?(?: \((?:in part )?now (.*)\))?")
+"""A line of the index: a decision, its heading, and what replaced it or parts of it."""
+REPLACES = re.compile(r"\b(?:replaces|amends|mends|takes back)\b[^.;]*?\[0*(\d+)\]", re.I)
+
+
+def numbers(lines: str | None) -> set[str]:
+    """Return the numbers of the decisions that lines link to."""
+    return set(re.findall(r"\[(\d{4})\]", lines or ""))
+
+
+def test_every_decision_is_in_the_index_with_what_replaced_it() -> None:
+    index = (DECISIONS / "README.md").read_text("utf-8")
+    rows = [HOLD.fullmatch(line) for line in index.splitlines() if line.startswith("* ")]
+    assert None not in rows, "a line is: * [NNNN](file) heading (in part now [NNNN](file))"
+    listed = [(row[2], row[3].lower()) for row in rows if row is not None]
+    texts = {path.name: path.read_text("utf-8") for path in DECISIONS.glob("[0-9]*.md")}
+    headings = {name: re.sub(r"^# [\d.]+:? *", "", text.splitlines()[0]) for name, text in texts.items()}
+    assert sorted(listed) == sorted((name, heading.lower()) for name, heading in headings.items()), (
+        "give the new decision a line of docs/decisions/README.md, under its subject, with its heading"
+    )
+    after = {row[1]: numbers(row[4]) for row in rows if row is not None}
+    for name, text in texts.items():
+        for found in REPLACES.findall(" ".join(text.splitlines()[:6])):
+            assert name[:4] in after[found.zfill(4)], f"{name} replaces a part of {found}: say so behind that"
+
+
 @pytest.mark.parametrize("inside", [False, True])
 def test_a_circle_is_found(tmp_path: Path, inside: bool) -> None:
     (tmp_path / "recon").mkdir()
