@@ -6,8 +6,6 @@ import contextlib
 import re
 import sys
 import threading
-import time
-from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -25,6 +23,7 @@ from drivers.dlpc900.slm import Dlpc900Options, Dlpc900Slm
 from drivers.errors import DeviceError, DeviceTimeoutError, LimitError, StoppedError
 from drivers.testing.slm import SlmContract
 from tests.mocks.dlpc900_device import BadImageError, Dlpc900Emulator, FakeHidraw, decode_image
+from tests.mocks.waiting import until
 
 SMALL = (24, 40)
 
@@ -561,15 +560,6 @@ def test_ctrl_c_within_a_message_does_not_swallow_the_next_one(
             device.display(pattern(1))
         device.display(pattern(2))
         np.testing.assert_array_equal(board.shown, pattern(2))
-
-
-def until(condition: Callable[[], bool], timeout_s: float = 10.0) -> bool:
-    deadline_s = time.monotonic() + timeout_s
-    while not condition():
-        if time.monotonic() > deadline_s:
-            return False
-        time.sleep(0.005)
-    return True
 
 
 def test_two_threads_may_blank_at_once(board: Dlpc900Emulator) -> None:

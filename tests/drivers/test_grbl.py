@@ -7,7 +7,7 @@ import math
 import re
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -18,6 +18,7 @@ from drivers.grbl.settings import GrblOptions
 from drivers.grbl.stage import GrblStage
 from tests.mocks.grbl_controller import GrblController
 from tests.mocks.pty_device import Answer
+from tests.mocks.waiting import in_background, until
 
 
 @pytest.fixture(params=[False, True], ids=["grbl", "hal"])
@@ -59,28 +60,6 @@ def plain_stage(plain: GrblController) -> Iterator[GrblStage]:
         yield stage
 
 
-def in_background(act: Callable[[], object]) -> tuple[threading.Thread, list[BaseException | None]]:
-    outcome: list[BaseException | None] = []
-
-    def run() -> None:
-        try:
-            act()
-            outcome.append(None)
-        except BaseException as error:  # noqa: BLE001 - handed to the test
-            outcome.append(error)
-
-    thread = threading.Thread(target=run)
-    thread.start()
-    return thread, outcome
-
-
-def wait_until(condition: Callable[[], object]) -> None:
-    deadline = time.monotonic() + 20
-    while not condition():
-        assert time.monotonic() < deadline
-        time.sleep(0.002)
-
-
 def true_um(board: GrblController) -> float:
     return 1e3 * board.place[0]
 
@@ -91,7 +70,7 @@ def test_a_cancel_that_comes_before_its_jog_is_read_is_sent_again(
 ) -> None:
     board.line_delay_s = 0.4
     thread, outcome = in_background(lambda: stage.move_to({"x_um": -19_000.0}))
-    wait_until(lambda: board._lines)
+    assert until(lambda: board._lines)
     stage.stop()
     thread.join(20)
     assert isinstance(outcome[0], StoppedError)
@@ -104,7 +83,7 @@ def test_a_cancel_that_comes_before_its_jog_is_read_is_sent_again(
 def test_stop_ends_homing_and_it_must_be_done_again(board: GrblController, stage: GrblStage) -> None:
     board.homing_s = 30.0
     thread, outcome = in_background(stage.home)
-    wait_until(lambda: board.received.count(b"$H") == 2)
+    assert until(lambda: board.received.count(b"$H") == 2)
     assert stage.is_moving
     stage.stop()
     thread.join(20)
@@ -157,7 +136,7 @@ def test_a_program_that_runs_when_the_stage_is_opened_is_halted_without_losing_s
 # Alarms and resets -------------------------------------------------------------------------------
 def test_a_limit_switch_ends_the_move_and_the_reference(board: GrblController, stage: GrblStage) -> None:
     thread, outcome = in_background(lambda: stage.move_to({"x_um": -19_000.0}))
-    wait_until(lambda: board.state == "Jog")
+    assert until(lambda: board.state == "Jog")
     board.hit_limit_switch()
     thread.join(20)
     assert "limit switch was hit" in str(outcome[0])
@@ -173,7 +152,7 @@ def test_a_limit_switch_ends_the_move_and_the_reference(board: GrblController, s
 
 def test_a_reset_in_motion_loses_the_reference(board: GrblController, stage: GrblStage) -> None:
     thread, outcome = in_background(lambda: stage.move_to({"x_um": -19_000.0}))
-    wait_until(lambda: board.state == "Jog")
+    assert until(lambda: board.state == "Jog")
     board._realtime(0x18)
     thread.join(20)
     assert "reset while it moved: steps may be lost (alarm 3)" in str(outcome[0])
@@ -241,7 +220,7 @@ def test_an_open_door_is_said(plain: GrblController, plain_stage: GrblStage) -> 
 
 def test_feed_hold_by_hand_is_no_arrival(board: GrblController, stage: GrblStage) -> None:
     thread, outcome = in_background(lambda: stage.move_to({"x_um": -19_000.0}))
-    wait_until(lambda: board.state == "Jog")
+    assert until(lambda: board.state == "Jog")
     board._realtime(ord("!"))
     thread.join(20)
     assert "came to rest elsewhere: x_um is at" in str(outcome[0])
@@ -376,7 +355,7 @@ def test_without_homing_an_alarm_is_unlocked_by_who_asks_for_it(
             stage.home()
             stage.move_to({"x_um": 100.0})
             plain.hit_limit_switch()
-            wait_until(lambda: not stage.is_homed)
+            assert until(lambda: not stage.is_homed)
         with pytest.raises(DeviceError, match=r"locked by an alarm.*is lost then.*Stage, Unlock.*unlock\(\)"):
             stage.home()
         assert stage.needs_unlocking
@@ -508,7 +487,7 @@ def test_older_firmware_is_refused(plain: GrblController) -> None:
 
 def test_unplugged_in_a_move_and_plugged_in_again(board: GrblController, stage: GrblStage) -> None:
     thread, outcome = in_background(lambda: stage.move_to({"x_um": -19_000.0}))
-    wait_until(lambda: board.state == "Jog")
+    assert until(lambda: board.state == "Jog")
     board.unplug()
     thread.join(20)
     assert re.search(r"stage \(grbl, .*was lost", str(outcome[0]))
@@ -525,7 +504,7 @@ def test_unplugged_in_a_move_and_plugged_in_again(board: GrblController, stage: 
 def test_unplugged_while_homing(plain: GrblController, plain_stage: GrblStage) -> None:
     plain.homing_s = 30.0
     thread, outcome = in_background(plain_stage.home)
-    wait_until(lambda: plain.received.count(b"$H") == 2)
+    assert until(lambda: plain.received.count(b"$H") == 2)
     plain.unplug()
     thread.join(20)
     assert "was lost" in str(outcome[0])

@@ -16,6 +16,7 @@ from drivers.led_array import OFF, LedPattern
 from instrument.plan.led_shapes import BrightField
 from tests.mocks.illuminate_emulator import IlluminateEmulator
 from tests.mocks.pty_device import Answer
+from tests.mocks.waiting import in_background, until
 
 BUILDS = {"1.32": ("1.32", False), "1.32 of 2021": ("1.32", True), "2.32": ("2.32", True)}
 """Version, and whether ``sc`` scales colours."""
@@ -51,28 +52,6 @@ def leds(array: IlluminateEmulator) -> Iterator[IlluminateLedArray]:
 def new_leds(new_array: IlluminateEmulator) -> Iterator[IlluminateLedArray]:
     with driver_of(new_array) as leds:
         yield leds
-
-
-def in_background(act: Callable[[], object]) -> tuple[threading.Thread, list[BaseException | None]]:
-    outcome: list[BaseException | None] = []
-
-    def run() -> None:
-        try:
-            act()
-            outcome.append(None)
-        except BaseException as error:  # noqa: BLE001 - handed to the test
-            outcome.append(error)
-
-    thread = threading.Thread(target=run)
-    thread.start()
-    return thread, outcome
-
-
-def wait_until(condition: Callable[[], object]) -> None:
-    deadline = time.monotonic() + 20
-    while not condition():
-        assert time.monotonic() < deadline
-        time.sleep(0.002)
 
 
 def repeat(act: Callable[[], object]) -> None:
@@ -113,7 +92,7 @@ def test_firmware_that_scales_colours_shows_every_level_exactly(tmp_path: Path) 
             assert tuple(array.lit[0]) == rgb
         leds.sequencer.load([leds.single(3, (9, 9, 9)), LedPattern("dark")])
         thread, outcome = in_background(lambda: leds.sequencer.run(300))
-        wait_until(lambda: array.lit[3].all())
+        assert until(lambda: array.lit[3].all())
         assert array.lit[3].tolist() == [9, 9, 9]
         thread.join(20)
         assert outcome == [None]
@@ -243,7 +222,7 @@ def test_off_overtakes_a_running_sequence(
 ) -> None:
     leds.sequencer.load([leds.single(k) for k in range(3)])
     thread, outcome = in_background(lambda: leds.sequencer.run(50, 1000, inputs=inputs, timeout_s=60.0))
-    wait_until(lambda: array.lit.any())
+    assert until(lambda: array.lit.any())
     assert not leds.pattern.is_dark
     leds.off()
     assert not array.lit.any()
@@ -259,7 +238,7 @@ def test_off_during_a_pattern_leaves_it_dark(array: IlluminateEmulator, leds: Il
     array.fault = lambda line, reply: [0.3, reply] if line.startswith(b"l.") else [reply]
     many = LedPattern("many", tuple((k, (k + 1, 0, 0)) for k in range(10)))
     thread, outcome = in_background(lambda: leds.set_pattern(many))
-    wait_until(lambda: array.lit.any())
+    assert until(lambda: array.lit.any())
     leds.off()
     thread.join(20)
     assert isinstance(outcome[0], StoppedError)
@@ -293,7 +272,7 @@ def test_off_of_a_lost_array_says_that_the_light_may_be_on(
 ) -> None:
     leds.set_pattern(leds.single(0))
     array.unplug()
-    wait_until(lambda: not leds.is_open)
+    assert until(lambda: not leds.is_open)
     with pytest.raises(DeviceError, match=r"was lost on .*The light may be on: look, and pull its supply"):
         leds.off()
     array.plug_in()
@@ -425,7 +404,7 @@ def test_ctrl_c_in_a_sequence_leaves_nothing_lit(
     def interrupted(words: bytes, timeout_s: float | None = None) -> list[bytes]:
         if words.startswith(b"rseq"):
             leds.link.send_now(words + b"\n")
-            wait_until(lambda: array.lit.any())
+            assert until(lambda: array.lit.any())
             raise KeyboardInterrupt
         return command(words, timeout_s)
 

@@ -38,6 +38,7 @@ from instrument.serve.operation import Operation, Operator
 from instrument.serve.server import BenchServer, Serving
 from tests.drivers.test_remote import BENCH, TOKEN
 from tests.mocks.bad_network import BadNetwork
+from tests.mocks.waiting import until
 
 PATIENCE_S = 20.0
 # In real time: a move is still under way when the network breaks.
@@ -67,13 +68,6 @@ def options(network: BadNetwork, tmp_path: Any) -> RemoteOptions:
     (tmp_path / "token").write_text(f"{TOKEN}\n")
     url = f"http://127.0.0.1:{network.port}"
     return RemoteOptions(url=url, token_file=str(tmp_path / "token"), lost_after_s=1.0)
-
-
-def until(true: Callable[[], bool]) -> None:
-    deadline_s = time.monotonic() + PATIENCE_S
-    while not true():
-        assert time.monotonic() < deadline_s
-        time.sleep(0.005)
 
 
 def served_bench(server: BenchServer) -> Bench:
@@ -129,7 +123,7 @@ def test_a_lost_operator_leaves_no_light_and_no_motion(
     off = bench.led_array.off  # type: ignore[union-attr]
     bench.led_array.off = lambda: (off(), light.append(bench.led_array.pattern.is_dark))  # type: ignore
     moving, errors = in_thread(lambda: stage.move_to({"x_um": high if stage.position()["x_um"] < 0 else low}))
-    until(lambda: carriage.is_moving)
+    assert until(lambda: carriage.is_moving)
     if how == "cut":
         network.cut()
     elif how == "silent":
@@ -137,7 +131,7 @@ def test_a_lost_operator_leaves_no_light_and_no_motion(
     else:
         server.close()
     moving.join(PATIENCE_S)
-    until(lambda: server.operation.operator is None)
+    assert until(lambda: server.operation.operator is None)
     assert light[0]
     assert not carriage.is_moving
     assert not any(device.is_open for device in bench.devices.values())
@@ -219,7 +213,7 @@ def test_a_slow_network_loses_frames_and_counts_them_and_a_stop_does_not_wait(
             assert metadata.frame_id == before.frame_id + 1 + metadata.dropped_before
         network.bytes_per_s = 1000.0  # the frame under way now takes longer than the test
         moving, errors = in_thread(lambda: stage.move_to({"x_um": stage.limits["x_um"][0]}))
-        until(lambda: stage.is_moving)
+        assert until(lambda: stage.is_moving)
         stage.stop()
         moving.join(PATIENCE_S)
         assert isinstance(errors[0], StoppedError)
@@ -247,7 +241,7 @@ def test_the_end_of_a_sequence_is_not_that_of_the_next_one(
         while time.monotonic() < until_s:
             camera.next_frame(PATIENCE_S)
         assert camera.is_streaming
-    until(lambda: server.operation.operator is None)
+    assert until(lambda: server.operation.operator is None)
 
 
 def test_pieces_that_are_none_end_the_sequence_in_words(
@@ -322,7 +316,7 @@ def test_there_is_one_operator_at_a_time_until_somebody_presses_stop(
     leds.set_pattern(LIT)
     server.operation.stop("somebody at the page")
     with pytest.raises(StoppedError, match="STOP was pressed by somebody at the page"):
-        until(lambda: leds.pattern is None)
+        assert until(lambda: leds.pattern is None)
     other.open()
     other.close()
     leds.close()
@@ -429,7 +423,7 @@ def test_pieces_that_come_while_their_sender_leaves_are_not_kept(
     if how == "drop":
         server.operation.stop("a test")
     leds.close()
-    until(lambda: not server._uploads._waiting)
+    assert until(lambda: not server._uploads._waiting)
 
 
 def _said_to_be(descr: str, *shape: int) -> str:

@@ -25,6 +25,7 @@ from drivers.second_display.outputs import Output, SecondDisplayOptions, choose
 from drivers.second_display.process import WindowProcess
 from drivers.second_display.slm import SecondDisplaySlm
 from drivers.testing.slm import SlmContract
+from tests.mocks.waiting import until
 
 ROOT = Path(__file__).parents[2]
 pytest.importorskip("PySide6.QtGui", reason="Qt cannot be loaded here", exc_type=ImportError)
@@ -188,15 +189,6 @@ def process_of(slm: SecondDisplaySlm) -> subprocess.Popen[bytes]:
     return slm._window._process
 
 
-def until(condition: Any, timeout_s: float = 20.0) -> bool:
-    deadline_s = time.monotonic() + timeout_s
-    while not condition():
-        if time.monotonic() > deadline_s:
-            return False
-        time.sleep(0.02)
-    return True
-
-
 def test_a_window_that_dies_is_an_error_and_opening_again_helps(slm: SecondDisplaySlm) -> None:
     process_of(slm).kill()
     with pytest.raises(DeviceError, match=r"slm \(second_display\): its window's process ended"):
@@ -282,7 +274,7 @@ def test_closing_ends_the_wait_for_settling() -> None:
     levels = np.ones(slm.shape, np.uint8)
     waiting = threading.Thread(target=lambda: slm.display(levels))
     waiting.start()
-    until(lambda: slm._displayed is not None and bool(slm._displayed.any()))
+    assert until(lambda: slm._displayed is not None and bool(slm._displayed.any()))
     slm.close()
     waiting.join(20)
     assert not waiting.is_alive()

@@ -26,6 +26,7 @@ from drivers.errors import DeviceError
 from drivers.second_display import slm as slm_module
 from drivers.second_display.outputs import SecondDisplayOptions
 from drivers.second_display.slm import SecondDisplaySlm
+from tests.mocks.waiting import until
 
 pytest.importorskip("PySide6.QtGui", reason="Qt cannot be loaded here", exc_type=ImportError)
 XORG = shutil.which("Xorg") or "/usr/lib/xorg/Xorg"
@@ -302,13 +303,13 @@ def screen_saver_is_on(server: str) -> bool:
 def test_the_x_server_keeps_its_screen_saver_off(server: str) -> None:
     subprocess.run(["xset", "s", "1", "1"], check=True)
     try:
-        assert until(lambda: screen_saver_is_on(server))
+        assert until(lambda: screen_saver_is_on(server), every_s=0.05)
         with SecondDisplaySlm(options()) as slm:
             assert slm.settings()["screen_saver_kept_off_by"] == "the X server"
             subprocess.run(["xset", "s", "reset"], check=True)
             time.sleep(2.5)
             assert not screen_saver_is_on(server)
-        assert until(lambda: screen_saver_is_on(server))
+        assert until(lambda: screen_saver_is_on(server), every_s=0.05)
     finally:
         subprocess.run(["xset", "s", "off"], check=True)
 
@@ -350,16 +351,7 @@ def test_a_wayland_desktop_shows_the_levels_on_the_output_asked_for(
                 on_x11.setenv("QT_QPA_PLATFORM", "xcb")
                 return bool((shot(0, 0, width, height) == ramp(slm.shape)[..., None]).all())
 
-        assert until(shown)
+        assert until(shown, every_s=0.05)
     checked = SecondDisplaySlm(options(output=found[0].address, check_by_screenshot=True))
     with checked, pytest.raises(DeviceError, match="allows no screenshot"):
         checked.blank()
-
-
-def until(condition: Callable[[], bool], timeout_s: float = 20.0) -> bool:
-    deadline_s = time.monotonic() + timeout_s
-    while not condition():
-        if time.monotonic() > deadline_s:
-            return False
-        time.sleep(0.05)
-    return True

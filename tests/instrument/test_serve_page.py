@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import shutil
-import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -27,8 +26,7 @@ from instrument.serve.watching import picture
 from recon.evaluation.scored import Point
 from tests.drivers.test_remote import BENCH, TOKEN
 from tests.mocks.devices import MockCamera, MockOptions, MockWorld, MockWorldOptions
-
-PATIENCE_S = 30.0
+from tests.mocks.waiting import until
 
 
 @pytest.fixture(scope="module")
@@ -56,22 +54,15 @@ def server() -> Iterator[BenchServer]:
         yield server
 
 
-def until(true: Callable[[], Any]) -> None:
-    deadline_s = time.monotonic() + PATIENCE_S
-    while not true():
-        assert time.monotonic() < deadline_s
-        time.sleep(0.02)
-
-
 def test_live_picture_state_and_stop(browser: Any, server: BenchServer, tmp_path: Any) -> None:
     def text(name: str) -> str:
         return str(browser.find_element("id", name).text)
 
     # Nobody operates: the page has the camera opened, and shows it.
     browser.get(f"{server.url}/#{TOKEN}")
-    until(lambda: text("age").startswith("Live: frame"))
+    assert until(lambda: text("age").startswith("Live: frame"))
     assert TOKEN not in browser.current_url
-    until(lambda: "SIMULATED" in text("state"))  # asked for now and then
+    assert until(lambda: "SIMULATED" in text("state"))  # asked for now and then
     assert "operated by\nnobody" in text("state")
     assert browser.execute_script("return document.getElementById('picture').width") == 320
 
@@ -82,23 +73,23 @@ def test_live_picture_state_and_stop(browser: Any, server: BenchServer, tmp_path
     camera.open()
     leds.open()
     leds.set_pattern(LedPattern("LED 7", ((7, (255, 255, 255)),)))
-    until(lambda: "LED 7" in text("state") and "process" in text("state"))
+    assert until(lambda: "LED 7" in text("state") and "process" in text("state"))
     camera.set_exposure_ms(7.5)
     frame = camera.snap()
-    until(lambda: f"frame {frame.metadata.frame_id}" in text("age") and "7.5 ms" in text("words"))
+    assert until(lambda: f"frame {frame.metadata.frame_id}" in text("age") and "7.5 ms" in text("words"))
 
     # STOP ends his operation.
     browser.find_element("id", "stop").click()
-    until(lambda: "Stopped: light off, motion stopped" in text("notice"))
+    assert until(lambda: "Stopped: light off, motion stopped" in text("notice"))
     with pytest.raises(StoppedError, match="STOP was pressed by somebody at 127"):
-        until(lambda: leds.pattern is None)
+        assert until(lambda: leds.pattern is None)
     for device in (camera, leds):
         device.close()
-    until(lambda: "operated by\nnobody" in text("state"))
+    assert until(lambda: "operated by\nnobody" in text("state"))
 
     # The server ends: nothing on the page passes for current.
     server.close()
-    until(lambda: "No connection to the bench" in text("notice") and "NOT CURRENT" in text("age"))
+    assert until(lambda: "No connection to the bench" in text("notice") and "NOT CURRENT" in text("age"))
     complaints = [
         entry for entry in browser.get_log("browser") if "WebSocket connection" not in entry["message"]
     ]
@@ -108,10 +99,10 @@ def test_live_picture_state_and_stop(browser: Any, server: BenchServer, tmp_path
 def test_a_wrong_token_is_asked_for_again(browser: Any, server: BenchServer) -> None:
     browser.get(f"{server.url}/#wrong")
     field = browser.find_element("id", "token")
-    until(field.is_displayed)
+    assert until(field.is_displayed)
     assert browser.find_element("id", "notice").text == "This token is not the bench's."
     field.send_keys(f"{TOKEN}\n")
-    until(
+    assert until(
         lambda: (
             browser.find_element("id", "bench").text.startswith("simulated")
             or browser.find_element("id", "state").text

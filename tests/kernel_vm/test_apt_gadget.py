@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 
 import pytest
 
@@ -13,6 +12,7 @@ from drivers.errors import DeviceError
 from tests.mocks.apt_controller import AptController, split_messages
 from tests.mocks.moving_axis import MovingAxis
 from tests.mocks.usb_gadget import UsbSerialGadget
+from tests.mocks.waiting import until
 
 pytestmark = pytest.mark.kernel_vm
 SERIAL_NUMBER = 27_501_971
@@ -37,7 +37,7 @@ def found() -> tuple[FoundDevice, ...]:
 
 
 def test_it_is_found_moves_and_comes_back_after_unplugging(cube: AptController) -> None:
-    assert until(lambda: len(found()) == 1)
+    assert until(lambda: len(found()) == 1, every_s=0.1)
     (device,) = found()
     assert (device.product, device.serial_number, device.usb_id) == ("KDC101", "27501971", "0403:faf0")
     axis = {"port": device.address, "controller": device.product, "actuator": "Z825"}
@@ -52,21 +52,12 @@ def test_it_is_found_moves_and_comes_back_after_unplugging(cube: AptController) 
         with pytest.raises(DeviceError, match="stage \\(apt"):
             stage.wait(30.0)
         assert not stage.is_open
-        assert until(lambda: not found())
+        assert until(lambda: not found(), every_s=0.1)
         with pytest.raises(DeviceError, match="there is no port"):
             stage.open()
         cube.port.plug_in()
-        assert until(lambda: len(found()) == 1)
+        assert until(lambda: len(found()) == 1, every_s=0.1)
         stage.open()
         assert stage.is_homed  # the cube has a power supply of its own
         stage.move_to({"x_um": 2000.0})
         assert cube.axes[0].motion.place == 68_608
-
-
-def until(condition: Callable[[], bool], timeout_s: float = 30.0) -> bool:
-    deadline_s = time.monotonic() + timeout_s
-    while not condition():
-        if time.monotonic() > deadline_s:
-            return False
-        time.sleep(0.1)
-    return True

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 
 import numpy as np
 import pytest
@@ -15,6 +14,7 @@ from drivers.errors import DeviceError
 from drivers.registry.buses import hid_devices
 from tests.mocks.dlpc900_device import Dlpc900Emulator
 from tests.mocks.uhid_device import UhidDevice
+from tests.mocks.waiting import until
 
 pytestmark = pytest.mark.kernel_vm
 SHAPE = (48, 64)
@@ -33,7 +33,7 @@ def board(monkeypatch: pytest.MonkeyPatch) -> Dlpc900Emulator:
 @pytest.fixture
 def device(board: Dlpc900Emulator) -> Iterator[UhidDevice]:
     device = plugged_in(board)
-    assert until(lambda: any(found.usb_id == "0451:c900" for found in hid_devices()))
+    assert until(lambda: any(found.usb_id == "0451:c900" for found in hid_devices()), every_s=0.1)
     yield device
     if not device._stopping.is_set():
         device.unplug()
@@ -64,19 +64,10 @@ def test_unplugged_is_an_error_and_plugged_in_again_it_works(
     board.power_cycle()
     again = plugged_in(board)
     try:
-        assert until(lambda: bool(Dlpc900Slm.discover()))
+        assert until(lambda: bool(Dlpc900Slm.discover()), every_s=0.1)
         slm.open()
         slm.display(np.full(SHAPE, 7, np.uint8))
         assert (board.shown == 7).all()
         slm.close()
     finally:
         again.unplug()
-
-
-def until(condition: Callable[[], bool], timeout_s: float = 20.0) -> bool:
-    deadline_s = time.monotonic() + timeout_s
-    while not condition():
-        if time.monotonic() > deadline_s:
-            return False
-        time.sleep(0.1)
-    return True

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 
 import pytest
 
@@ -11,6 +10,7 @@ from drivers.registry.buses import hid_devices, serial_ports, usb_devices, video
 from tests.mocks.dlpc900_device import Dlpc900Emulator
 from tests.mocks.uhid_device import UhidDevice
 from tests.mocks.usb_gadget import UsbSerialGadget
+from tests.mocks.waiting import until
 
 pytestmark = pytest.mark.kernel_vm
 NAMES = ("Kuo Optics", "Diffuser Stage", "SN-0042")
@@ -27,7 +27,7 @@ def devices() -> Iterator[None]:
 
 @pytest.mark.usefixtures("devices")
 def test_every_bus_says_what_is_on_it() -> None:
-    assert until(lambda: any(port.usb_id == "1d6b:0104" for port in serial_ports()))
+    assert until(lambda: any(port.usb_id == "1d6b:0104" for port in serial_ports()), every_s=0.1)
     (port,) = (port for port in serial_ports() if port.usb_id == "1d6b:0104")
     assert (port.vendor, port.product, port.serial_number) == NAMES
     (usb,) = (device for device in usb_devices() if device.usb_id == "1d6b:0104")
@@ -37,12 +37,3 @@ def test_every_bus_says_what_is_on_it() -> None:
     assert hid.serial_number == "LCR9"
     assert hid.address.startswith("/dev/hidraw")
     assert any("vivid" in device.description for device in video_devices())
-
-
-def until(condition: Callable[[], bool], timeout_s: float = 20.0) -> bool:
-    deadline_s = time.monotonic() + timeout_s
-    while not condition():
-        if time.monotonic() > deadline_s:
-            return False
-        time.sleep(0.1)
-    return True
