@@ -157,6 +157,30 @@ def test_every_link_between_pages_leads_somewhere() -> None:
     assert lost == []
 
 
+def defined(path: Path) -> set[str]:
+    """Return what a module's own lines name."""
+    found = set()
+    for node in parsed(path).body:
+        if isinstance(node, ast.FunctionDef | ast.ClassDef):
+            found.add(node.name)
+        for target in getattr(node, "targets", [getattr(node, "target", None)]):
+            found |= {n.id for n in ast.walk(target) if isinstance(n, ast.Name)} if target else set()
+    return found
+
+
+def test_code_that_panels_copy_imports_names_from_where_they_are() -> None:
+    files, lost, count = module_files(ROOT), [], 0
+    for path in (ROOT / "gui").rglob("*.py"):
+        for node in ast.walk(parsed(path)):
+            match node:
+                case ast.Tuple(elts=[ast.Constant(str(module)), ast.Constant(str(name))]) if module in files:
+                    count += 1
+                    if files[module].name != "__init__.py" and name not in defined(files[module]):
+                        lost.append(f"{path.relative_to(ROOT)}: from {module} import {name}")
+    assert lost == []
+    assert count > 10
+
+
 DECISIONS = ROOT / "docs" / "decisions"
 HOLD = re.compile(r"\* \[(\d{4})\]\((\S+)\) (?:~~)?(.*?)(?:~~)?(?: \((?:in part )?now (.*)\))?")
 """A line of the index: a decision, its heading, and what replaced it or parts of it."""

@@ -155,8 +155,14 @@ class LivePanel(Panel):
     # Panel ---------------------------------------------------------------------------------------
     def as_python(self) -> str:
         """Return lines that bring the camera to these settings and take the same photograph."""
-        names = ("LightState", "photograph_name", "switch_light", "write_snapshot")
-        imports = Imports({("instrument.bench.photograph", name) for name in names})
+        imports = Imports(
+            {
+                ("instrument.bench.lit", "LightState"),
+                ("instrument.bench.lit", "switch_light"),
+                ("instrument.bench.photograph_file", "photograph_name"),
+                ("instrument.bench.photograph_file", "write_snapshot"),
+            }
+        )
         light, bench = self.light, self.session.bench
         lines = []
         if (state := self.form.state) is not None:

@@ -137,7 +137,7 @@ class RunsPanel(Panel):
         if opened is not None and self._can_resume:
             return script(ResumeProcedure(opened.path), self.session.config.path)
         if opened is not None and opened.run is None:
-            imports.names.add(("instrument.bench.photograph", "read_snapshot"))
+            imports.names.add(("instrument.bench.photograph_file", "read_snapshot"))
             lines = [f"taken = read_snapshot({expression(opened.path, imports)})", "print(taken.metadata)"]
         elif opened is not None:
             imports.names.add(("instrument.runs.run", "Run"))
