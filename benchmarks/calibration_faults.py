@@ -61,7 +61,7 @@ from calibration_routines.routine import routines
 from calibration_routines.scatter import compare
 from instrument.bench.bench import Bench, open_bench
 from instrument.bench.config_file import parse_config, template
-from instrument.display.hologram import bench_display
+from instrument.display.bench_display import bench_display
 from instrument.files.errors import BenchError
 from instrument.runs.run_control import RunControl
 from recon.camera.registration import moved

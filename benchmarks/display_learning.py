@@ -30,7 +30,8 @@ from calibration_routines.display.hologram_photograph import HologramCamera
 from calibration_routines.display.pattern_series import photograph_series
 from instrument.bench.bench import open_bench
 from instrument.bench.config_file import parse_config
-from instrument.display.hologram import CaptureOptions, bench_display, prepare_target
+from instrument.display.bench_display import bench_display
+from instrument.display.hologram import CaptureOptions, prepare_target
 from instrument.files.sample_images import load_sample
 from recon.base.threads import set_threads
 from recon.holography import HologramModel, compute_hologram

@@ -37,7 +37,8 @@ from calibration_routines.display.mask_alignment import (
 from drivers.simulated.display import SENSOR, DisplayWorld
 from instrument.bench.bench import Bench
 from instrument.bench.config_file import parse_config, template
-from instrument.display.hologram import bench_display, prepare_target
+from instrument.display.bench_display import bench_display
+from instrument.display.hologram import prepare_target
 from instrument.files.sample_images import load_sample
 from recon.holography import DcTerm, Display, HologramModel, compute_hologram
 from recon.holography.camera_map import register_camera

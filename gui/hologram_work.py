@@ -22,13 +22,12 @@ from gui.widgets.entry import existing_path
 from instrument.bench.bench import Bench
 from instrument.bench.config import BenchConfig
 from instrument.bench.safety import StepsFailedError
+from instrument.display.alignment import Alignment, load_alignment
+from instrument.display.bench_display import bench_display
 from instrument.display.hologram import (
-    Alignment,
     CaptureOptions,
     HologramResult,
-    bench_display,
     compute_and_judge,
-    load_alignment,
     prepare_target,
     read_picture,
 )
@@ -282,9 +281,11 @@ def compute_lines(order: HologramOrder, config: BenchConfig, weights: str | None
 
     ``weights`` is the expression that makes the weights; None where there are none.
     """
-    hologram = ("bench_display", "compute_and_judge", "prepare_target", "read_picture", "slm_size")
+    hologram = ("compute_and_judge", "prepare_target", "read_picture")
     imports = Imports({("instrument.display.hologram", name) for name in hologram})
     imports.names |= {
+        ("instrument.display.bench_display", "bench_display"),
+        ("instrument.display.bench_display", "slm_size"),
         ("instrument.bench.config_file", "load_config"),
         ("instrument.display.hologram_files", "HologramFiles"),
     }
@@ -298,7 +299,7 @@ def compute_lines(order: HologramOrder, config: BenchConfig, weights: str | None
         "display = options.display_of(bench_display(config, slm_size(config), expansion=options.expansion))",
     ]
     if order.alignment is not None:
-        imports.names.add(("instrument.display.hologram", "load_alignment"))
+        imports.names.add(("instrument.display.alignment", "load_alignment"))
         lines.append(f"display = load_alignment({expression(order.alignment, imports)}).of(display)")
     lines += [
         f"planes = {expression([(order.picture, order.z_mm), *order.further], imports)}",

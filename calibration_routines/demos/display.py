@@ -33,14 +33,9 @@ from calibration_routines.display.pattern_series import photograph_series
 from calibration_routines.procedure import Listener
 from instrument.bench.bench import Bench, open_bench
 from instrument.bench.config_file import parse_config
-from instrument.display.hologram import (
-    Alignment,
-    bench_display,
-    colour_shares,
-    prepare_target,
-    save_alignment,
-    square,
-)
+from instrument.display.alignment import Alignment, save_alignment
+from instrument.display.bench_display import bench_display
+from instrument.display.hologram import colour_shares, prepare_target, square
 from instrument.display.hologram_files import CHANNELS
 from instrument.files.figures import Convergence, Panel, Summary, save_figure, summary_figure
 from instrument.files.sample_images import load_sample, portrait_in_colour

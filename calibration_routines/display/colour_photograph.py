@@ -20,7 +20,7 @@ from calibration_routines.display.hologram_photograph import (
     display_of_pattern,
     target_of_pattern,
 )
-from instrument.display.hologram import Alignment
+from instrument.display.alignment import Alignment
 from instrument.display.hologram_files import CHANNELS
 from instrument.files.errors import BenchError
 from instrument.files.images import Pixels, write_image

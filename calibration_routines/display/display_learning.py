@@ -17,7 +17,8 @@ from calibration_routines.options import Checked
 from calibration_routines.procedure import Listener, Outcome, Outlook, Procedure
 from calibration_routines.routine import Routine
 from instrument.bench.bench import Bench
-from instrument.display.hologram import Alignment, bench_display, load_alignment, save_alignment
+from instrument.display.alignment import Alignment, load_alignment, save_alignment
+from instrument.display.bench_display import bench_display
 from instrument.files.atomic import named_by_worth, require_new
 from instrument.files.record import plain
 from instrument.files.slm_image import load_slm_correction

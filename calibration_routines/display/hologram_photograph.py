@@ -16,14 +16,9 @@ import numpy.typing as npt
 from calibration_routines.display.display_io import DisplayBench
 from calibration_routines.display.spot_photograph import registered_camera
 from instrument.bench.config import BenchConfig
-from instrument.display.hologram import (
-    Alignment,
-    CaptureOptions,
-    bench_display,
-    prepare_target,
-    square,
-    within,
-)
+from instrument.display.alignment import Alignment
+from instrument.display.bench_display import bench_display
+from instrument.display.hologram import CaptureOptions, prepare_target, square, within
 from instrument.display.hologram_files import CHANNELS
 from instrument.files.errors import BenchError
 from instrument.files.images import Pixels, write_image

@@ -54,7 +54,8 @@ from calibration_routines.routine import Routine
 from calibration_routines.scatter import STEADY, Scatter
 from drivers.errors import StoppedError
 from instrument.bench.bench import Bench
-from instrument.display.hologram import Alignment, bench_display, save_alignment
+from instrument.display.alignment import Alignment, save_alignment
+from instrument.display.bench_display import bench_display
 from instrument.files.atomic import named_by_worth, require_new
 from instrument.files.record import plain
 from instrument.files.slm_image import load_slm_correction

@@ -17,7 +17,8 @@ from calibration_routines.options import Checked
 from calibration_routines.procedure import Listener, Outcome, Outlook, Procedure
 from calibration_routines.routine import Routine
 from instrument.bench.bench import Bench
-from instrument.display.hologram import bench_display, load_alignment
+from instrument.display.alignment import load_alignment
+from instrument.display.bench_display import bench_display
 from instrument.files.atomic import require_new
 from instrument.files.record import plain
 from instrument.runs.run_control import RunControl

@@ -32,7 +32,8 @@ from gui.widgets.building import Hint, button, fill, in_column, in_row, label, s
 from gui.widgets.dialogues import choose_path
 from gui.widgets.hologram_views import WEIGHTS_SHAPE, HologramViews, WeightsMode
 from instrument.bench.config_file import TEMPLATES
-from instrument.display.hologram import depth_limit_mm, expansion_side, field_picture, field_words, square
+from instrument.display.bench_display import depth_limit_mm, expansion_side
+from instrument.display.hologram import field_picture, field_words, square
 from instrument.files.errors import BenchError
 from instrument.files.images import read_image
 from instrument.reconstruction.forecast import Forecast

@@ -14,15 +14,14 @@ import typer
 from instrument.cli.app import App, BenchOption, examples, load_and_say
 from instrument.cli.progress import first_interrupt_cancels, one_task
 from instrument.cli.tasks import Terminal, finish
+from instrument.display.alignment import load_alignment
+from instrument.display.bench_display import bench_display, slm_size
 from instrument.display.hologram import (
     HologramResult,
-    bench_display,
     compute_and_judge,
     field_words,
-    load_alignment,
     prepare_target,
     read_weights,
-    slm_size,
     unshowable,
 )
 from instrument.display.hologram_files import CHANNELS, HologramFiles, light_words, score_words

@@ -22,7 +22,7 @@ from recon.base.declare import option
 if TYPE_CHECKING:
     from calibration_routines.display.colour_photograph import ColourPattern
     from calibration_routines.display.display_io import DisplayBench
-    from instrument.display.hologram import Alignment
+    from instrument.display.alignment import Alignment
     from instrument.runs.run import Run
 
 app = App()
@@ -139,7 +139,7 @@ def _show_hologram(what: list[Path], options: ShowOptions, bench: Path | None) -
     """Put patterns on the SLM; hold them, or photograph what they show."""
     from calibration_routines.display.colour_photograph import colour_patterns
     from calibration_routines.display.display_io import DisplayBench, bring_mask
-    from instrument.display.hologram import load_alignment
+    from instrument.display.alignment import load_alignment
     from instrument.files.slm_image import (
         is_of_mirrors,
         levels_field,

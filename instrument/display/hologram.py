@@ -1,48 +1,35 @@
-"""From image files to holograms: the bench's display, its mask's alignment, targets, optimiser, verdict."""
+"""From image files to holograms: targets, optimiser, verdict."""
 
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
-from math import ceil, isqrt
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass
+from math import ceil
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import cv2
 import numpy as np
 import numpy.typing as npt
 
-from instrument.bench.config import BenchConfig
 from instrument.files.errors import BenchError, FileError
 from instrument.files.images import ImageFile, read_image
-from instrument.files.record import RecordFormat, plain, value_of
-from instrument.files.slm_image import mismatch
 from recon.base.declare import option, record
 from recon.holography import (
-    DcTerm,
     Display,
     Hologram,
     HologramModel,
     HologramOptions,
     HologramRecord,
-    ScatteringMask,
     Scores,
     Target,
     compute_hologram,
-    random_mask,
 )
-from recon.holography.display import greatest_defocus_mm, no_mask
-from recon.holography.learned import Learned
 from recon.holography.limit import limited_by
 from recon.holography.options import Fit
-from recon.holography.pose import NODES, Pose
 from recon.holography.scores import compare
 from recon.holography.target import EVERYWHERE, FIRST_ORDER, Window, band_of, near_window
-
-if TYPE_CHECKING:
-    from drivers.slm import Slm
-
 
 Image = npt.NDArray[np.float64]
 JUDGED_PX = 21
@@ -347,195 +334,3 @@ def read_weights(path: Path) -> npt.NDArray[np.float64]:
     if pixels.ndim != 2 or pixels.min() < 0 or pixels.max() <= 0:
         raise FileError(path, "is no weight image: grey, not negative, not all zero.")
     return np.asarray(pixels, np.float64)
-
-
-def slm_size(
-    config: BenchConfig, *, phases: bool = True, spots: bool = False
-) -> tuple[tuple[int, int], float]:
-    """Ask the bench's SLM for its shape and pixel pitch in micrometres; opens and closes it.
-
-    ``phases``: it is to show phases; ``spots``: those of spots.
-
-    Raises BenchError when the bench has no SLM, or phases are asked of mirrors; DeviceError when it does not
-    answer.
-    """
-    from instrument.bench.bench import Bench
-
-    if "slm" not in config.devices:
-        raise BenchError(f"{config.label} has no [slm], so it is not known what to compute a hologram for.")
-    bench = Bench(config)
-    try:
-        slm: Slm = bench.open_device("slm")  # type: ignore[assignment]
-        if phases and (words := mismatch(slm, mirrors=False, spots=spots)):
-            raise BenchError(words)
-        return slm.shape, slm.pixel_pitch_um
-    finally:
-        bench.close()
-
-
-def bench_display(
-    config: BenchConfig,
-    size: tuple[tuple[int, int], float],
-    *,
-    expansion: int | None = None,
-    wavelength_nm: float | None = None,
-) -> Display:
-    """Return the display that ``[display]`` describes.
-
-    ``size`` is the SLM's shape and pitch, of :func:`slm_size`. Another ``expansion`` than the bench's has a
-    random mask of its own, 1 none; with another wavelength the mask keeps its height.
-
-    Raises BenchError or FileError when SLM, binning, expansion and mask do not fit together.
-    """
-    table = config.display
-    q = expansion or table.expansion
-    k = expansion_side(q)
-    (height, width), pitch_um = size
-    binning = table.slm_binning
-    if height % binning or width % binning:
-        raise BenchError(f"An SLM of {height} x {width} pixels cannot be binned by slm_binning = {binning}.")
-    shape = (height // binning, width // binning)
-    if q == 1 and (table.mask_file is None or table.expansion != 1):
-        mask = no_mask(shape, design_wavelength_nm=table.wavelength_nm)
-    elif table.mask_file is not None and q == table.expansion:
-        base = config.path.parent if config.path else Path()
-        mask = _mask_from(base / table.mask_file, (shape[0] * k, shape[1] * k), table.wavelength_nm)
-    else:
-        mask = random_mask(
-            (shape[0] * k, shape[1] * k), seed=table.mask_seed, design_wavelength_nm=table.wavelength_nm
-        )
-    return Display(
-        shape,
-        mask,
-        slm_pitch_um=pitch_um * binning,
-        wavelength_nm=wavelength_nm or table.wavelength_nm,
-        focal_mm=table.focal_mm,
-        dc=DcTerm(table.dc_power, table.dc_phase_rad),
-        mask_fill=table.mask_fill,
-    )
-
-
-def depth_limit_mm(
-    config: BenchConfig, size: tuple[tuple[int, int], float], *, expansion: int | None = None
-) -> float:
-    """Return how far out of focus a plane may lie for :func:`bench_display`, without making its mask."""
-    table = config.display
-    k = expansion_side(expansion or table.expansion)
-    (height, width), pitch_um = size
-    binning = table.slm_binning
-    shape = (height // binning * k, width // binning * k)
-    return greatest_defocus_mm(shape, pitch_um * binning / k, table.wavelength_nm, table.focal_mm)
-
-
-def expansion_side(expansion: int) -> int:
-    """Return how many mask pixels an étendue expansion puts along each side of an SLM pixel.
-
-    Raises BenchError when the expansion is no square.
-    """
-    side = isqrt(expansion)
-    if side * side != expansion:
-        raise BenchError(f"The expansion must be a square (1, 4, 9, 16, 25, 36 ...), not {expansion}.")
-    return side
-
-
-def _mask_from(path: Path, shape: tuple[int, int], wavelength_nm: float) -> ScatteringMask:
-    """Read a binary mask image: two values, the greater one is pi."""
-    from instrument.files.images import read_image
-
-    pixels = read_image(path).pixels
-    values = np.unique(pixels)
-    if pixels.shape != shape:
-        raise FileError(path, f"is a mask of {pixels.shape} pixels; SLM and expansion need {shape}.")
-    if len(values) != 2:
-        raise FileError(path, f"holds {len(values)} different values; a binary mask has two (0 and pi).")
-    return ScatteringMask((pixels == values[1]).astype(np.uint8), np.array([0.0, np.pi]), wavelength_nm)
-
-
-ALIGNMENT = RecordFormat(
-    "diffuserbench mask alignment", "mask alignment", make="Make one: diffuserbench align mask"
-)
-
-
-@dataclass(frozen=True, slots=True)
-class Alignment:
-    """Where the mask was found."""
-
-    pose: Pose
-    """Left over with the stage at ``stage_position``."""
-    error: Mapping[str, float]
-    """Standard uncertainties, by the name of the pose's parameter."""
-    rest: npt.NDArray[np.float64]
-    """(rows, columns, 2): smooth displacement beyond the pose's, on the nodes of ``Pose.displacement``, mask
-    pixels."""
-    efficiency: float
-    """Spot brightness over the model's ideal."""
-    stage_position: Mapping[str, float]
-    """Where the stage was, by the names of its axes."""
-    mask_shape: tuple[int, int]
-    """Of the mask that it holds for, in pixels."""
-    simulated: bool
-    learned: Learned | None = None
-    """What photographs taught of the display."""
-    corrected: bool | None = None
-    """Whether they were taken with an SLM calibration, which holds from then on."""
-    psnr_lost_db: float | None = None
-    """What a hologram loses to what is not known of the mask's place."""
-
-    def of(self, display: Display) -> Display:
-        """Return the display with this mask's displacement.
-
-        Raises FileError when the alignment is another mask's, or was learned with the lens of a display that
-        has none.
-        """
-        if display.mask.shape != self.mask_shape:
-            raise FileError(
-                "alignment",
-                f"holds for a mask of {self.mask_shape} pixels; this display's has {display.mask.shape}.",
-            )
-        displacement = self.pose.displacement(self.mask_shape) + self.rest
-        display = replace(display, lost_db=self.psnr_lost_db)
-        if self.learned is None:
-            return replace(display, displacement=displacement)
-        if display.distance_mm is not None:
-            raise FileError(
-                "alignment",
-                "holds what was learned behind the display's Fourier lens, and the picture is shown without "
-                "one: give the alignment from align mask, without what was learned.",
-            )
-        turns = display.mask.design_wavelength_nm / display.wavelength_nm
-        return replace(display, displacement=displacement).taught(self.learned.at(turns))
-
-    def require_correction(self, given: bool) -> None:
-        """Refuse to show a pattern otherwise than what was learned of the display.
-
-        Raises BenchError where it was learned with an SLM calibration and none is given, or the other way.
-        """
-        if self.learned is not None and self.corrected is not None and self.corrected != given:
-            raise BenchError(
-                "This display was learned "
-                + (
-                    "with an SLM calibration: give the same --slm-calibration."
-                    if self.corrected
-                    else "without an SLM calibration: leave --slm-calibration out, or learn it again."
-                )
-            )
-
-
-def save_alignment(path: Path, alignment: Alignment, facts: Mapping[str, Any]) -> None:
-    """Write an alignment with further facts; errors as ``write_text``."""
-    ALIGNMENT.write(path, {**plain(alignment), "rest": alignment.rest.round(4), **facts})
-
-
-def load_alignment(path: Path) -> Alignment:
-    """Read an alignment.
-
-    Raises FileError when it is missing, no alignment, or damaged.
-    """
-    record = ALIGNMENT.read(path)
-    with ALIGNMENT.damaged(path):
-        alignment = value_of(Alignment, record)  # what is not the alignment's own are facts about it
-        if not np.isfinite(alignment.pose.vector()).all():
-            raise ValueError("the pose is not finite")
-        if alignment.rest.shape != (*NODES, 2) or not np.isfinite(alignment.rest).all():
-            raise ValueError(f"'rest' should be {(*NODES, 2)} numbers, not {alignment.rest.shape}")
-        return alignment

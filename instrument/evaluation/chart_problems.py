@@ -10,7 +10,8 @@ from typing import Any
 import numpy as np
 
 from instrument.bench.config import BenchConfig
-from instrument.display.hologram import bench_display, field_words, prepare_target, read_picture, slm_size
+from instrument.display.bench_display import bench_display, slm_size
+from instrument.display.hologram import field_words, prepare_target, read_picture
 from instrument.files.errors import BenchError
 from instrument.files.sample_images import SAMPLES
 from instrument.reconstruction.job import Job

@@ -13,15 +13,14 @@ import numpy as np
 import numpy.typing as npt
 
 from instrument.bench.config import BenchConfig
+from instrument.display.alignment import load_alignment
+from instrument.display.bench_display import bench_display, slm_size
 from instrument.display.hologram import (
     HologramResult,
-    bench_display,
     compute_and_judge,
     field_words,
-    load_alignment,
     prepare_target,
     read_picture,
-    slm_size,
 )
 from instrument.display.hologram_files import HologramFiles, hologram_figure
 from instrument.display.hologram_forecast import forecast_hologram as by_its_beginning

@@ -8,14 +8,9 @@ from pathlib import Path
 from typing import Annotated
 
 from instrument.bench.config import BenchConfig
-from instrument.display.hologram import (
-    bench_display,
-    field_words,
-    load_alignment,
-    prepare_target,
-    read_picture,
-    slm_size,
-)
+from instrument.display.alignment import load_alignment
+from instrument.display.bench_display import bench_display, slm_size
+from instrument.display.hologram import field_words, prepare_target, read_picture
 from instrument.display.hologram_files import HologramFiles
 from instrument.display.limit import (
     SharedTime,

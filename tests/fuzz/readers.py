@@ -14,7 +14,7 @@ import numpy as np
 import tifffile
 
 from instrument.bench.config_file import load_config, template
-from instrument.display.hologram import load_alignment
+from instrument.display.alignment import load_alignment
 from instrument.files.calibration_file import calibrated_depths_um, load_calibration, save_calibration
 from instrument.files.images import read_image, read_stack
 from instrument.files.record import plain

@@ -23,7 +23,8 @@ from gui.panels.holograms import HologramsPanel
 from gui.session import BenchSession
 from gui.widgets.result_views import best_columns
 from instrument.bench.config_file import parse_config
-from instrument.display.hologram import bench_display, depth_limit_mm, square
+from instrument.display.bench_display import bench_display, depth_limit_mm
+from instrument.display.hologram import square
 from instrument.files.images import read_image, write_image
 from instrument.files.slm_image import levels_phase, read_slm_image
 from recon.errors import InputError

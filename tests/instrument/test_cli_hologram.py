@@ -23,14 +23,9 @@ from calibration_routines.display.spot_photograph import photograph_spots
 from instrument.bench.config_file import parse_config, template
 from instrument.cli import main
 from instrument.display import hologram_forecast
-from instrument.display.hologram import (
-    Alignment,
-    CaptureOptions,
-    bench_display,
-    field_picture,
-    field_words,
-    prepare_target,
-)
+from instrument.display.alignment import Alignment
+from instrument.display.bench_display import bench_display
+from instrument.display.hologram import CaptureOptions, field_picture, field_words, prepare_target
 from instrument.display.limit import SharedTime, at_most, coarser_mask, limit_lines
 from instrument.display.spots import middle_line
 from instrument.files.errors import BenchError, FileError

@@ -27,7 +27,8 @@ from drivers.simulated.display import DisplayWorld
 from instrument.bench.bench import Bench
 from instrument.bench.config_file import parse_config, template
 from instrument.cli import main
-from instrument.display.hologram import bench_display, load_alignment
+from instrument.display.alignment import load_alignment
+from instrument.display.bench_display import bench_display
 from instrument.files.errors import BenchError
 from instrument.files.images import write_image
 from instrument.files.slm_image import SlmCorrection, load_slm_correction, phase_levels
