@@ -10,9 +10,8 @@ from drivers.frame import Frame
 from gui.session import BenchSession
 from gui.session_news import OwnFiles, names_of
 from instrument.bench.config import BenchConfig
-from instrument.bench.lit import LightState
+from instrument.bench.lit import LightState, spoilt
 from instrument.bench.lit import light_of as lit_now
-from instrument.bench.photograph import spoilt
 from instrument.bench.photograph_file import PHOTOGRAPHS
 from instrument.files.atomic import DOUBTFUL
 from instrument.files.calibration_file import newest_calibration

@@ -7,9 +7,14 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from drivers.led_array import LedPattern
+from instrument.bench.photograph import SPOILT
+from recon.base.checks import SATURATED_SHARE
 
 if TYPE_CHECKING:
     from instrument.bench.bench import Bench
+
+SPOILT_PSF = SATURATED_SHARE
+"""As ``SPOILT``, of a photograph of the point source, whose brightest pixels explain every later one."""
 
 
 class LightState(enum.StrEnum):
@@ -19,6 +24,11 @@ class LightState(enum.StrEnum):
     SOURCE = "source"
     DARK = "dark"
     AS_IS = "as-is"
+
+
+def spoilt(saturated_share: float, light: LightState) -> bool:
+    """Whether so many saturated pixels spoil a photograph in this light."""
+    return saturated_share > (SPOILT_PSF if light is LightState.SOURCE else SPOILT)
 
 
 def switch_light(bench: Bench, light: LightState) -> None:

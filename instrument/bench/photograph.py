@@ -10,20 +10,10 @@ import numpy.typing as npt
 
 from drivers.camera import Camera
 from drivers.frame import Frame, FrameMetadata
-from instrument.bench.lit import LightState
 from instrument.files.errors import BenchError
-from recon.base.checks import SATURATED_SHARE
 
 SPOILT = 1e-3
 """Share of saturated pixels from which a photograph is: a few are the sensor's, or a lamp's reflection."""
-SPOILT_PSF = SATURATED_SHARE
-"""The same of a photograph of the point source, whose brightest pixels explain every later one."""
-
-
-def spoilt(saturated_share: float, light: LightState) -> bool:
-    """Whether so many saturated pixels spoil a photograph in this light."""
-    return saturated_share > (SPOILT_PSF if light is LightState.SOURCE else SPOILT)
-
 
 Progress = Callable[[int, int], object]
 """Called with how many are done so far, and how many there are in all."""

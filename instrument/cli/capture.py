@@ -10,8 +10,8 @@ import numpy as np
 import typer
 
 from instrument.bench.bench import Bench
-from instrument.bench.lit import LightState, switch_light
-from instrument.bench.photograph import Snapshot, spoilt
+from instrument.bench.lit import LightState, spoilt, switch_light
+from instrument.bench.photograph import Snapshot
 from instrument.bench.photograph_file import check_photograph_file, photograph_name, write_snapshot
 from instrument.cli.app import (
     App,
