@@ -8,6 +8,7 @@ import os
 import signal
 import sys
 import traceback
+from functools import partial
 from pathlib import Path
 from types import FrameType, TracebackType
 
@@ -67,9 +68,8 @@ def _shown(app: QApplication, config: BenchConfig, settings: QSettings) -> tuple
     waker.start(_SIGNAL_CHECK_MS)
 
     def end(number: int, _frame: FrameType | None) -> None:
-        session.log("warning", f"Signal {signal.Signals(number).name}: closing.")
-        session.stop()
-        session.close()
+        # Not here: Python calls this between any two of its steps, also in the midst of a job's start.
+        QTimer.singleShot(0, session, partial(session.end_by, signal.Signals(number).name))
 
     # Before the window is made: Python's own KeyboardInterrupt would get lost in one of Qt's callbacks.
     before = {}

@@ -336,6 +336,8 @@ class JobRunner(QObject):
             if number not in self._waiting:
                 taken |= job.lanes
         for number in list(self._waiting):
+            if number not in self._waiting:
+                continue  # withdrawn by what the start of one before it has led to
             job = self._jobs[number]
             if not (job.lanes & taken):
                 self._waiting.remove(number)

@@ -395,6 +395,12 @@ class BenchSession(QObject):
         jobs = self.jobs.jobs
         self._in_thread("closing the bench", self._close_all, jobs)
 
+    def end_by(self, signal: str) -> None:
+        """Stop and close for a signal of the system, whose name is told."""
+        self.log("warning", f"Signal {signal}: closing.")
+        self.stop()
+        self.close()
+
     def join(self, timeout_s: float = 5.0) -> bool:
         """Wait for all threads, after ``closed``; returns whether they ended. For the end of the program."""
         deadline_s = time.monotonic() + timeout_s

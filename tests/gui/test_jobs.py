@@ -199,3 +199,14 @@ def test_jobs_end_without_a_word_once_what_shows_them_is_gone(jobs: JobRunner, q
     qtbot.waitUntil(lambda: running.is_over and later.is_over, timeout=WAIT_MS)
     assert heard == []
     assert not jobs.jobs
+
+
+def test_a_start_may_withdraw_what_waits_behind_it(qtbot: QtBot, jobs: JobRunner) -> None:
+    """As STOP does that is pressed, or a signal of the system that comes, while jobs are started."""
+    first = jobs.device("first", lambda _: None, {"camera"})
+    second = jobs.device("second", lambda _: None, {"stage"})
+    first.started.connect(lambda: jobs.withdraw(second))
+    with qtbot.waitSignal(first.ended, timeout=WAIT_MS):
+        pass
+    assert second.state is JobState.CANCELLED
+    assert jobs.jobs == ()
