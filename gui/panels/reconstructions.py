@@ -442,6 +442,9 @@ class ReconstructionsPanel(Panel):
         self.form.options.set_values({"kind": PSF})
         self.form.options.set_values({"psf": files.psf, "image": files.photograph})
         self.form.start.setFocus()
+        start = self.form.start.click  # that is what was asked for; the form says why it cannot be
+        if not self._names.once_known(start):
+            start()
 
     def _offer_calibration(self, newest: Path | None) -> None:
         """Begin with the newest calibration where none was named."""

@@ -37,6 +37,7 @@ def stops_of(window: QWidget) -> Iterator[QWidget]:
     part = window.nextInFocusChain()
     while part is not None and part is not window:
         takes = part.focusPolicy() & Qt.FocusPolicy.TabFocus and part.focusProxy() is None
+        takes = takes and not (isinstance(part, QTabBar) and not part.count())  # of docks that are all hidden
         if takes and part.isVisible() and part.isEnabled():
             yield part
         part = part.nextInFocusChain()
