@@ -28,8 +28,6 @@ def in_words(n_bytes: float) -> str:
     return f"{n_bytes / GIB:.2f} GiB" if n_bytes >= 0.1 * GIB else f"{n_bytes / 2**20:.1f} MiB"
 
 
-VOLUMES = {"tv": 6, "l1": 2}
-"""Volumes that each solver keeps: X, g and four states; z and the transfer functions."""
 LOW_MODES = 3.4 * 2**20
 """Bytes of the matrices of a preconditioner's lowest modes, of pictures and volumes of any size."""
 KEPT_FREE = 0.1
@@ -93,8 +91,8 @@ def plan(
 
     Parameters
     ----------
-    kind : str
-        A key of :data:`VOLUMES`.
+    kind : {"tv", "l1"}
+        Whose solver: of ``tv`` X, g and four states are kept, of ``l1`` z and the transfer functions.
     domain_shape : tuple of int
         ``(1, n_z, grid_height, grid_width)``: channels are reconstructed one after the other.
     psf_values, result_values : int
