@@ -157,6 +157,15 @@ def test_every_link_between_pages_leads_somewhere() -> None:
     assert lost == []
 
 
+def test_every_page_is_in_the_list_of_pages() -> None:
+    """Decisions have an index of their own; what a benchmark writes is shown on its page."""
+    docs = ROOT / "docs"
+    listed = (docs / "README.md").read_text("utf-8")
+    pages = {path.relative_to(docs).as_posix() for path in docs.rglob("*.md")}
+    unlisted = sorted(page for page in pages if f"]({page}" not in listed and "decisions/" not in page)
+    assert unlisted == ["README.md", "benchmarks/auto-model-table.md"], "add a line to docs/README.md"
+
+
 def defined(path: Path) -> set[str]:
     """Return what a module's own lines name."""
     found = set()
