@@ -29,6 +29,8 @@ from recon.optics.jit import extensions_put_off
 
 _FRAME = QSize(16, 40)
 """What a window manager puts round a window, at most: the first window fits the screen with it."""
+HANDOVER_S = 0.001
+"""After which a thread of Python hands over to another that waits (0296)."""
 _log = logging.getLogger(__name__)
 _SIGNAL_CHECK_MS = 200
 """Python sees signals only while it runs: an idle event loop has to be woken for them."""
@@ -96,6 +98,7 @@ def _shown(app: QApplication, config: BenchConfig, settings: QSettings) -> tuple
 
 def show_and_open(window: MainWindow) -> None:
     """Show a window, and open its bench when it was seen: what takes long is done before there is light."""
+    sys.setswitchinterval(HANDOVER_S)
     load = extensions_put_off()  # before panels are prepared, which begins with the first events
     application().processEvents()  # to be made and to be shown are turns of their own
     window.show()

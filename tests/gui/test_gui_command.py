@@ -125,7 +125,12 @@ def test_ctrl_c_while_the_window_is_made_ends_it(
         window.deleteLater()
 
     monkeypatch.setattr(app, "show_and_open", interrupted)
-    assert main(["gui", str(tmp_path / "bench.toml")]) == 0
+    usual_s = sys.getswitchinterval()
+    try:
+        assert main(["gui", str(tmp_path / "bench.toml")]) == 0
+        assert sys.getswitchinterval() == pytest.approx(0.001), "a click waits for no thread longer (0296)"
+    finally:
+        sys.setswitchinterval(usual_s)
     assert ends.isActive()  # nothing had to end it
 
 
