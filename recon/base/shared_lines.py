@@ -30,7 +30,7 @@ noise of 60 counts put on the hand's rows 0.91, of 100 and more 0.95 to 0.96."""
 LEAST = 1.0
 """Deviation of lines from which they are levelled, in units of a pixel's noise. Measured sets at bins 1 to 24
 have up to 0.99 by the finer differences (a pair at bin 6), simulated scenes of 64 to 192 pixels 0.53."""
-CAST = 2.0
+CAST = 1.25
 """Deviation of an object's lines relative to its mean (black and white bars 1), of which a PSF lets some
 through."""
 STIFFNESS = 10.0 ** np.arange(-4, 9, 0.25)

@@ -14,6 +14,7 @@ from recon.base.shared_lines import shared_lines
 from recon.camera.camera_model import CAMERAS, Extent, ModelName
 from recon.errors import InputError
 from recon.reconstruction.background import (
+    BELOW_ZERO,
     DARKEST,
     DARKEST_PERCENTILE,
     EXPLAINS,
@@ -49,10 +50,6 @@ from recon.reconstruction.weights import kind_of
 from recon.types import Calibration
 
 Array = npt.NDArray[Any]
-BELOW_ZERO = 0.15
-"""How far a background of a picture that is taken for light may lie below zero, relative to the data's mean.
-Two measured pairs less a tenth of their mean have 0.20 and 0.29; light that falls off 0.08 (a measured pair),
-0.07 to 0.13 (simulated scenes, where an offset instead was -1.0 to +1.0 dB); simulated stray light 0."""
 
 
 def choose(

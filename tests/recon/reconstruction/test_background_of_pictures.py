@@ -9,6 +9,8 @@ import numpy as np
 import pytest
 
 from recon import reconstruct
+from recon.base.blocks import block_mean
+from recon.evaluation.measured_sets import data_folder, measured_set
 from recon.evaluation.scene import Family, TestScene, make_scene
 from recon.reconstruction import selection
 from recon.reconstruction.background import (
@@ -26,6 +28,10 @@ from recon.reconstruction.options import ReconstructionOptions
 from recon.reconstruction.part import Part
 from recon.reconstruction.problem import Problem
 from recon.reconstruction.residual import background_in_words, beyond_in_words
+
+measured = pytest.mark.skipif(
+    not (data_folder() / "diffusercam_hand").is_dir(), reason=f"the measured hand is not in {data_folder()}"
+)
 
 
 def lit(stray: float) -> TestScene:
@@ -139,3 +145,30 @@ def test_a_background_that_is_no_light_explains_most_of_what_nothing_else_does()
     assert not film.explains
     assert usaf.helps
     assert usaf.explains
+
+
+@pytest.mark.parametrize(
+    ("light", "least", "picture", "asked"),
+    [
+        (-0.07, -0.9, True, False),  # what a PSF cut to a circle lacks
+        (0.18, -0.25, True, False),  # a photograph less a tenth of its mean
+        (0.18, -0.1, True, True),
+        (-0.3, -0.9, False, True),  # a volume's, of light from beyond its depths
+    ],
+)
+def test_what_a_background_below_zero_explains_by_half_is_no_light(
+    light: float, least: float, picture: bool, asked: bool
+) -> None:
+    trial = Trial(5.9, 1.7, light, 0.3, LIT_PICTURE if picture else VOLUME, least=least, picture=picture)
+    assert trial.asks() is asked
+    assert replace(trial, without=22.0).asks()  # hardly anything is left: a PSF over light of the room
+
+
+@measured
+def test_a_psf_cut_to_a_circle_is_no_reason_for_a_background() -> None:
+    psfs, photograph = measured_set("hand")
+    psf, image = block_mean(psfs[0], 8), block_mean(photograph, 8)
+    image = image + np.float32(0.02 * image.mean())  # of a dark level: else nobody looks
+    y, x = (np.arange(n) - n / 2 for n in psf.shape)
+    cut = np.where(y[:, None] ** 2 + x**2 < (0.45 * len(y)) ** 2, psf, 0).astype(np.float32)
+    assert reconstruct(image, cut, iterations=5, judged=False).background is None
