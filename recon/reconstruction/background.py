@@ -200,8 +200,8 @@ def _tried(problem: Problem, *, whole: bool) -> Trial:
         taken = VOLUME
     expected = taken is LIT_PICTURE
     least = min(0.0, float(lit.background[0][valid].min()) / max(mean, 1e-30)) if expected else 0.0
-    picture = problem.n_planes == 1
-    trial = Trial(np.inf, error(lit.left), light, dark, taken, least=least, picture=picture)
+    one = problem.n_planes == 1
+    trial = Trial(np.inf, error(lit.left), light, dark, taken, least=least, picture=one)
     plain = replace(coarse, smooth=False)
     # One prior for both: less light has less of it.
     found = pilot(
