@@ -56,6 +56,8 @@ def test_adjoint_norm_and_the_plain_sum() -> None:
     x, y = rng.standard_normal(camera.domain_shape), rng.standard_normal(camera.range_shape)
     assert np.vdot(camera.forward(x), y) == pytest.approx(np.vdot(x, camera.adjoint(y)), rel=1e-10)
     assert estimate_norm(camera) <= camera.norm_bound * (1 + 1e-9)
+    brighter = camera_of(3 * patterns(3), np.float64)
+    assert brighter.norm_bound == pytest.approx(3 * camera.norm_bound)
     inside = np.zeros(camera.domain_shape)
     inside[0, 0][camera.window] = scene()
     expected = [cast(scene() * pattern) for pattern in patterns(3)]

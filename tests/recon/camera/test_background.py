@@ -118,6 +118,7 @@ def test_a_restrained_background_is_the_penalised_one(erased):
     rng = np.random.default_rng(4)
     valid, y = rng.random((9, 8)) >= erased, rng.standard_normal((1, 9, 8)) * 3 + 2
     removal = BackgroundRemoval((1, 9, 8), (3, 2), valid, np.float64, restraint=0.4)
+    assert 0 < removal.taken < 1
     rows, columns, _ = removal.basis(0)
     basis = np.einsum("ay,bx->yxab", rows, columns).reshape(72, 6) * valid.ravel()[:, None]
     wanted = np.concatenate([(y[0] * valid).ravel(), np.zeros(72)])

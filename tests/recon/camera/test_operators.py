@@ -8,7 +8,8 @@ from scipy.signal import convolve2d
 
 from recon.camera.base import LinearOperator, estimate_norm
 from recon.camera.convolution import Convolution
-from recon.camera.factors import Erasures
+from recon.camera.factors import Erasures, as_cropped_convolution
+from recon.errors import StructureError
 
 
 def matrix(operator: LinearOperator) -> np.ndarray:
@@ -102,6 +103,17 @@ def test_erasures_compose_with_the_camera():
     assert np.array_equal(erased @ x, (camera @ x) * valid)
     assert matrix(erased) == pytest.approx(matrix(camera) * np.tile(valid.ravel(), 2)[:, None])
     assert erased.norm_bound >= np.linalg.norm(matrix(erased), 2)
+
+
+def test_what_is_no_convolution_of_a_picture_is_told_as_what_it_is():
+    camera = Convolution(np.ones((1, 4, 5)), (5, 6))
+    erased = Erasures(np.ones((5, 6), bool), (1, 5, 6)) @ (Erasures(np.eye(5, 6) > 0, (1, 5, 6)) @ camera)
+    cropped = as_cropped_convolution(erased)
+    assert cropped.convolution is camera
+    np.testing.assert_array_equal(cropped.weight[0], np.eye(5, 6))
+    for other in (2 * camera, Convolution(np.ones((2, 1, 4, 5)), (5, 6))):
+        with pytest.raises(StructureError, match="needs a Convolution of a picture"):
+            as_cropped_convolution(other)
 
 
 def test_composition_refuses_what_does_not_fit():

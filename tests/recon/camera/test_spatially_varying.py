@@ -169,7 +169,7 @@ def test_psfs_of_other_channels_are_refused():
         local_convolution([field(GRID, channels=2), field(GRID, channels=3)], (9, 9))
 
 
-@pytest.mark.parametrize(("start", "length"), [(0, 26), (-8, 26), (-3, 23)])
+@pytest.mark.parametrize(("start", "length"), [(0, 26), (-8, 26), (-3, 23), (12, 26)])
 def test_an_axis_is_as_long_as_what_must_not_be_wrapped_onto(start, length):
     axis = Axis.of(start, 17, 10, 20, real=True)
     assert axis.length == fft.fast_length(length, real=True)

@@ -143,6 +143,46 @@ def test_differences_adjoint(shape, wrap, dtype):
     assert np.linalg.norm(forward) <= psi.norm_bound * np.linalg.norm(x)
 
 
+@pytest.mark.parametrize("weights", [(0.7,), (0.5, 2.0), (0.3, 0.5, 2.0)])
+def test_the_bound_of_wrapped_differences_is_their_norm(weights):
+    psi = Differences((2, 4, 6), weights, dtype=np.float64)  # of even sides: light and dark in turn
+    units = np.eye(48).reshape(-1, 2, 4, 6)
+    norm = np.linalg.norm(np.stack([psi.forward(unit).ravel() for unit in units]), 2)
+    assert psi.norm_bound == pytest.approx(norm)
+
+
+def test_differences_may_weigh_each_depth_otherwise():
+    by_depth = np.array([[0.3, 1.0, 0.5], [0.4, 0.9, 2.0]])
+    x = np.random.default_rng(0).standard_normal((2, 4, 6))
+    psi = Differences(x.shape, by_depth, dtype=np.float64)
+    expected = np.stack([np.roll(x, -1, axis) - x for axis in range(3)]) * by_depth.T[:, :, None, None]
+    np.testing.assert_allclose(psi.forward(x), expected)
+    assert np.linalg.norm(psi.forward(x)) <= psi.norm_bound * np.linalg.norm(x)
+    assert psi.norm_bound == pytest.approx(2 * np.sqrt(0.4**2 + 1.0 + 4.0))
+
+
+@pytest.mark.parametrize(
+    ("weights", "wrap", "words"),
+    [
+        ((1.0, 1.0), (True,), "wrap has 1 entries for 2 weights"),
+        ((1.0,) * 4, None, r"Weights \(4,\) do not fit"),
+        (np.ones((3, 2)), None, r"Weights \(3, 2\) do not fit"),
+        (np.ones((2, 2, 2)), None, "do not fit"),
+        (np.ones(0), None, "do not fit"),
+    ],
+)
+def test_weights_that_do_not_fit_are_refused(weights, wrap, words):
+    with pytest.raises(ValueError, match=words):
+        Differences((2, 4, 6), weights, wrap)
+
+
+def test_haar_total_variation_is_of_each_picture_by_itself():
+    x = np.random.default_rng(5).standard_normal((2, 5, 6))
+    assert HaarTotalVariation(0.3).value(x) == pytest.approx(TotalVariation(0.3).value(x))
+    alone = np.concatenate([HaarTotalVariation(0.3).prox(one[None], 0.7) for one in x])
+    np.testing.assert_allclose(HaarTotalVariation(0.3).prox(x, 0.7), alone)
+
+
 def test_sums_that_are_not_known_are_refused():
     with pytest.raises(TypeError, match="TotalVariation, TotalVariation"):
         (TotalVariation(1.0) + TotalVariation(1.0)).prox(np.ones((1, 4, 4)), 1.0)

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from recon.base import fft
 from recon.camera.convolution import Convolution
 from recon.camera.factors import BackgroundRemoval
 from recon.camera.varying_psfs import FieldOfPsfs, local_convolution
@@ -301,6 +302,24 @@ def test_other_data_are_solved_at_once_and_the_first_again_bring_back_what_was()
     np.testing.assert_allclose(penalty * bent, change, atol=1e-9)
     solver.set_data(SensorData(DATA, VALID))
     np.testing.assert_allclose(iterate(solver), before, atol=1e-9)
+
+
+@pytest.mark.parametrize("kind", [VolumeAdmm, LeanTotalVariation])
+def test_data_of_an_object_that_moved_leave_what_the_moved_object_does_not_explain(kind: Any) -> None:
+    solver = kind(CAMERA, SensorData(DATA, VALID), volume_tv() + NonNegativity())
+    solver.system.follow = lambda _: None
+    solver.system.tolerance, solver.system.max_steps = 1e-13, 200
+    for _ in range(3):
+        solver.advance()
+    kept = solver.X.copy()
+    for shift in ((0.0, 0.0), (2.0, 1.0)):
+        solver.move(*shift)
+        other = DATA[:, ::-1].copy()
+        solver.set_data(SensorData(other, VALID))
+        kept = solver.X.copy()
+        x = fft.irfft(solver.X, CAMERA.grid_shape[1])[None]
+        solver.X = kept
+        np.testing.assert_allclose(solver.e, (VALID * (other - CAMERA.forward(x)))[0], atol=1e-9)
 
 
 def test_other_data_bring_a_background_as_restrained_as_it_is_by_then() -> None:

@@ -1,0 +1,47 @@
+"""The penalties of a picture's ADMM, and what its records tell of both kinds of splits."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from recon.camera.convolution import Convolution
+from recon.priors import NonNegativity, TotalVariation
+from recon.solvers import Admm, Penalties, StoppingRules
+
+RNG = np.random.default_rng(3)
+CAMERA = Convolution(RNG.random((1, 4, 5)) ** 3, (7, 8), dtype=np.float64)
+DATA = CAMERA.forward(RNG.random(CAMERA.domain_shape) ** 6)
+POWER = float(np.mean(CAMERA.power()))
+TV = TotalVariation(0.03) + NonNegativity()
+
+
+def run(times: float, penalties: Penalties | None) -> np.ndarray:
+    solver = Admm(CAMERA, times * DATA, TotalVariation(0.03 * times) + NonNegativity(), penalties=penalties)
+    solver.run(StoppingRules(iterations=40, tolerance=0))
+    return np.array(solver.penalties)
+
+
+def test_a_penalty_that_is_given_stays_and_one_that_is_not_follows_the_weight_over_the_brightness() -> None:
+    assert run(1.0, Penalties(0.5, 0.8, 1.5))[:, 0] == pytest.approx([0.5, 0.8 * POWER, 1.5 * POWER])
+    own = run(1.0, None)
+    assert run(100.0, None) == pytest.approx(own, rel=1e-6), "in other units it is the same problem"
+    assert own[1, 0] != pytest.approx(POWER)
+
+
+def test_without_a_weight_no_penalty_is_taken_away() -> None:
+    solver = Admm(CAMERA, DATA, TotalVariation(0.0) + NonNegativity())
+    out = solver.run(StoppingRules(iterations=40, tolerance=0))
+    assert np.isfinite(out.solution).all()
+    assert (solver.penalties > 0).all()
+
+
+def test_a_record_tells_the_split_that_is_further_off() -> None:
+    solver = Admm(CAMERA, DATA, TV)
+    for _ in range(3):
+        solver.step()
+    agreed, apart = solver._record(1.0, 0.0, 0.0, 1.0, 1.0), solver._record(1.0, 1e4, 1e6, 1.0, 1.0)
+    assert agreed.primal_residual > 0
+    assert agreed.dual_residual > 0
+    assert apart.primal_residual == pytest.approx(100.0)
+    assert apart.dual_residual == pytest.approx(1000.0)
