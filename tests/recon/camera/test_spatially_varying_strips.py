@@ -6,7 +6,7 @@ from scipy.signal import convolve2d
 
 from recon.base.threads import get_threads, set_threads
 from recon.camera.base import estimate_norm
-from recon.camera.spatially_varying import Part, SpatiallyVarying, Strip, _tiling
+from recon.camera.spatially_varying import RUN, Part, SpatiallyVarying, Strip, _tiling
 from recon.camera.varying_psfs import FieldOfPsfs, local_convolution
 from recon.errors import InputError
 
@@ -101,6 +101,46 @@ def test_the_cost_is_half_a_transform_along_each_axis_there_and_back():
     assert placed.height == operator.domain_shape[2] == SENSOR[0] + 3
     long, tall = placed.axis.length, int(placed.parts[0, 1])
     assert operator.fft_pixels == 2 * (long * (SENSOR[0] + 3 + SENSOR[0]) + 2 * long * tall)
+
+
+def test_each_part_of_a_strip_costs_its_own_columns():
+    first, second = part(slice(0, 9), (0, 1)), part(slice(7, 15), (1,))
+    costs = [
+        SpatiallyVarying([strip(0, (slice(0, 15), slice(0, 61)), parts)], FIELD, SENSOR, n_channels=2)
+        for parts in ([first], [second], [first, second])
+    ]
+    (alone,), (other,), (both,) = (operator._depths[0] for operator in costs)
+    rows = [both.axis.length * (2 * 15 + s.bottom - s.top) for s in (alone, other, both)]
+    columns = [operator.fft_pixels - n for operator, n in zip(costs, rows, strict=True)]
+    assert columns[2] == columns[0] + columns[1]
+    assert columns == [both.axis.length * n for n in (3 * 12, 2 * 11, 3 * 12 + 2 * 11)]
+
+
+def test_tall_strips_are_added_once_whoever_adds_them():
+    """More rows than a worker takes at once, of strips that begin below the first."""
+    height = 3 * RUN + 5
+    field, sensor = (height, 9), (height - 3, 6)
+    laid = [
+        strip(0, (slice(top, height), slice(0, 9)), [part(slice(top, height), (0,))], (-1, -2), masks=1)
+        for top in (0, 70)
+    ]
+    before, backs = get_threads(), []
+    x, y = RNG.standard_normal((2, 1, *field)), RNG.standard_normal((2, *sensor))
+    try:
+        for threads in (1, 3):
+            set_threads(threads)
+            operator = SpatiallyVarying(laid, field, sensor, n_channels=2, dtype=np.float64)
+            backs.append(operator.adjoint(y))
+            assert np.vdot(operator.forward(x), y) == pytest.approx(np.vdot(x, backs[-1]), rel=1e-12)
+    finally:
+        set_threads(before)
+    np.testing.assert_array_equal(*backs)
+
+
+def test_the_bound_of_a_single_pixel_psf_is_not_below_its_norm():
+    one = FieldOfPsfs(np.full((1, 1, 1, 1), 0.7), np.zeros((1, 2)))
+    for dtype in (np.float32, np.float64):
+        assert 0.7 <= local_convolution([one], SENSOR, dtype=dtype).norm_bound < 0.7001
 
 
 @pytest.mark.parametrize("which", ["mask", "weight", "psf", "second psf"])

@@ -8,6 +8,7 @@ import pytest
 from recon.camera.convolution import Convolution
 from recon.priors import NonNegativity, TotalVariation
 from recon.solvers import Admm, Penalties, StoppingRules
+from recon.solvers.admm import DataSplit
 
 RNG = np.random.default_rng(3)
 CAMERA = Convolution(RNG.random((1, 4, 5)) ** 3, (7, 8), dtype=np.float64)
@@ -45,3 +46,25 @@ def test_a_record_tells_the_split_that_is_further_off() -> None:
     assert agreed.dual_residual > 0
     assert apart.primal_residual == pytest.approx(100.0)
     assert apart.dual_residual == pytest.approx(1000.0)
+
+
+@pytest.mark.parametrize("width", [14, 15, 16, 18])
+def test_the_datas_split_begins_with_what_the_object_casts_and_counts_its_change_on_any_grid(
+    width: int,
+) -> None:
+    """Grids of even and odd sides: of an even one the last column of half a spectrum stands alone."""
+    camera = Convolution(RNG.random((1, 4, 5)) ** 3, (7, 9), grid_shape=(10, width), dtype=np.float64)
+    x = RNG.random(camera.domain_shape)
+    weight = np.ones(camera.range_shape)
+    explained = DataSplit(camera, camera.forward(x), weight, 0.7, x, 1.6)
+    np.testing.assert_allclose(explained.Q, 0, atol=1e-9)
+    np.testing.assert_allclose(explained.sums[0, [0, 1, 2, 4]], 0, atol=1e-16)
+    split = DataSplit(camera, RNG.random(camera.range_shape), weight, 0.7, x, 1.6)
+
+    def prox() -> np.ndarray:
+        return np.fft.irfft2(split.T[0] - split.Q[0], camera.grid_shape)
+
+    for _ in range(2):
+        before = prox()
+        split.solve(0, RNG.random(camera.grid_shape), 0.3, 0.2)
+        assert split.sums[0, 2] == pytest.approx(np.sum((prox() - before) ** 2))

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
 import pytest
 
 from recon.base import fft
+from recon.base.threads import get_threads, set_threads
 from recon.camera.convolution import Convolution
 from recon.camera.factors import BackgroundRemoval
 from recon.camera.varying_psfs import FieldOfPsfs, local_convolution
@@ -228,9 +230,19 @@ def test_a_start_is_seen_and_what_is_solved_obeys_the_bounds_or_the_first_other_
     np.testing.assert_array_equal(made(tv)._solved, start)
 
 
+@pytest.fixture
+def many_threads() -> Iterator[None]:
+    """As many as there are planes, whatever the machine has."""
+    before = get_threads()
+    set_threads(3)
+    yield
+    set_threads(before)
+
+
 @pytest.mark.parametrize("started", [False, True])
 @pytest.mark.parametrize("isotropic", [False, True])
 @pytest.mark.parametrize("planes", [1, 3])
+@pytest.mark.usefixtures("many_threads")
 def test_compiled_sweeps_are_the_same_iterations(planes: int, isotropic: bool, started: bool) -> None:
     camera = Convolution(CAMERA_PSFS[:planes], SENSOR, dtype=np.float64)
     start = np.random.default_rng(8).random(camera.domain_shape) if started else None
@@ -244,6 +256,12 @@ def test_compiled_sweeps_are_the_same_iterations(planes: int, isotropic: bool, s
             assert getattr(found, name) == pytest.approx(getattr(expected, name), rel=1e-6, abs=1e-9)
         np.testing.assert_allclose(compiled.solution, plain.solution, atol=1e-8)
         assert followed[-1] == max(found.primal_residual, found.dual_residual)
+    for solver in (plain, compiled):
+        solver.move(2.0, 1.0)
+        solver.set_data(SensorData(DATA[:, ::-1].copy(), VALID))
+        for _ in range(2):
+            solver.advance()
+    np.testing.assert_allclose(compiled.solution, plain.solution, atol=1e-8)
 
 
 def test_a_device_is_asked_for_the_memory_of_all_volumes(monkeypatch: pytest.MonkeyPatch) -> None:

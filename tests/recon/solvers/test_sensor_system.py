@@ -108,7 +108,8 @@ def test_a_camera_that_is_no_convolution_is_preconditioned_by_its_central_one():
         dtype=np.float64,
         bend=lambda e: central._bend(e) * 1.1,
     )
-    made.set_scale(2.0)
+    for one in (central, made):
+        one.set_scale(5.0)
     made.set_curvature(CAMERA.power()[0] / CAMERA.power().mean())
     right = made.masked(RNG.standard_normal(SENSOR))
     made.solve(right, e := np.zeros(SENSOR))
