@@ -256,6 +256,7 @@ class OptionsForm(QWidget):
         if widget is None:
             return False
         reason = self._reasons[name]
+        why = self.in_its_words(why)
         text = why if why.endswith((".", "?")) else f"{why}."
         if text.partition(" ")[0].isalpha():  # no file's name
             text = text[:1].upper() + text[1:]

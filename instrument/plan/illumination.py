@@ -50,7 +50,7 @@ class IlluminationOptions:
     exposure_ms: float | None = option(
         None,
         help="Of every frame.",
-        default_words="found with what stands before the camera now",
+        default_words="found for the present scene",
         unit="ms",
         least=1e-3,
     )
@@ -80,7 +80,7 @@ class IlluminationOptions:
 
     def __post_init__(self) -> None:
         if sum(given is not None for given in (self.groups, self.lattice, self.pattern)) != 1:
-            either = "Give the patterns either as --groups, --lattice N or --pattern NAME (one of them)"
+            either = "Give the patterns as one of --groups, --lattice and --pattern"
             raise SettingsError([("groups", either)])
 
     @property

@@ -15,6 +15,7 @@ from pytestqt.qtbot import QtBot
 from gui.forms.fields import AUTOMATIC, Behaviour
 from gui.forms.options_form import OptionsForm
 from instrument.files.errors import BenchError
+from instrument.plan.illumination import IlluminationOptions
 from recon.base.declare import option, options_of
 from recon.errors import InputError
 
@@ -199,3 +200,11 @@ def test_a_form_is_made_a_field_at_a_time(qtbot: QtBot) -> None:
 )
 def test_messages_name_fields_and_no_flags(form: OptionsForm, said: str, shown: str) -> None:
     assert form.in_its_words(said) == shown
+
+
+def test_a_reason_speaks_of_fields_not_of_the_terminals_options(qtbot: QtBot) -> None:
+    form = OptionsForm([IlluminationOptions])
+    qtbot.addWidget(form)
+    form.refuse("groups", "Give the patterns as one of --groups, --lattice and --pattern")
+    assert form.reason("groups") == "Give the patterns as one of “Groups”, “Lattice” and “Pattern”."
+    assert "--" not in form.widgets["groups"].toolTip()
