@@ -51,7 +51,7 @@ _TRANSFORMS = {
     "aligning the mask": 14600.0,
     "aligning the demo's mask": 4800.0,
     "render the animal's light": 6500.0,
-    "blind deconvolution": 2000.0,
+    "blind deconvolution": 13000.0,
     "learning": 28000.0,
     "expose without saturating": 120.0,
     "dark frames and axial sweep": 510.0,
