@@ -32,6 +32,11 @@ def test_a_block_takes_longer_where_it_is_the_first_of_its_worker() -> None:
     assert module._Solved(reports, 20.0).beside_s == pytest.approx(20.0 - (6.4 + 3.7)), "a cluster's start"
 
 
+def test_a_frame_that_takes_longer_once_a_block_stands_for_no_other() -> None:
+    pace = module._one_by_one([report(0, "a", 5.0, 5.9), report(1, "a", 3.0, 3.2, 3.8, 4.0)])
+    assert pace(11, False) == pytest.approx(3.0 + 10 * 0.2 + 0.5)
+
+
 def test_frames_solved_together_go_by_their_iterations() -> None:
     pace = module._together([report(0, "a", 1.5, 1.5, 1.5, 1.5)], 1.5)
     assert pace(4, True) == pytest.approx(1.5 * 2.0)
@@ -48,6 +53,11 @@ def test_the_first_frames_are_carried_out_and_nothing_is_left(
         solved.append([len(block) for block in prepared.job.blocks])
         return true(prepared, *rest)
 
+    written: list[int] = []
+    film = module.write_shown
+    monkeypatch.setattr(
+        module, "write_shown", lambda made, frames: (written.append(len(frames)), film(made, frames))
+    )
     monkeypatch.setattr(module, "solve_video", noted)
     monkeypatch.setattr(module, "FRAMES", 2)
     monkeypatch.setattr(module.MemoryMeter, "peak_mib", lambda _meter: 3.0)  # a warm process may take none
@@ -59,6 +69,7 @@ def test_the_first_frames_are_carried_out_and_nothing_is_left(
         assert told.seconds > told.beside_s > 0
         assert told.memory_bytes == 3 * 2**20
     assert max(solved[0]) == 2
+    assert written == [1, 10, 1, 10], "an encoder is given as many pictures as the film has, up to a number"
     assert solved[1] == [5, 4], "what is solved together is carried out so"
     assert not list(tmp_path.iterdir())
 
