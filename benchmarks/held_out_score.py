@@ -35,14 +35,7 @@ def points_of(family: str, size: int, seed: int) -> list[Point]:
     """Run every setting but the local model's and float64 (others differ from them by little)."""
     depths = {} if family.endswith("picture") else {"depths": 4}
     scene = make_scene(family, size=size, seed=seed, grid=3, fall_off_deg=20.0, **depths)
-    problem = ChartProblem(
-        scene.measurement,
-        scene.calibration,
-        not scene.spec.is_picture,
-        scene.erasures,
-        scene.noise,
-        scene.truth,
-    )
+    problem = ChartProblem.of_scene(scene)
     return [
         point
         for setting in problem.settings()

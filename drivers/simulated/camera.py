@@ -3,14 +3,11 @@
 from __future__ import annotations
 
 import hashlib
-import os
 import threading
 import time
 from collections import deque
-from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -22,6 +19,7 @@ from drivers.errors import DeviceError, DeviceTimeoutError, LimitError, StoppedE
 from drivers.frame import Frame, FrameMetadata
 from drivers.simulated.camera_settings import SimulatedCameraSettings
 from drivers.simulated.faults import disturbed, disturbs
+from drivers.simulated.look import Look
 from drivers.simulated.wire import Pulse
 from drivers.simulated.world import Rgb, SimulatedWorld
 from recon.optics.sensor import FixedPattern, Readout, expose
@@ -34,51 +32,6 @@ class _Received(NamedTuple):
 
     pulse: Pulse
     seen: threading.Event
-
-
-class _Look:
-    """Light that is computed in a thread of its own: who ends an exposure does not wait for it.
-
-    Parameters
-    ----------
-    see : callable
-        Returns the light.
-    """
-
-    def __init__(self, see: Callable[[], npt.NDArray[np.float32]]) -> None:
-        self._see = see
-        self._seen: npt.NDArray[np.float32] | None = None
-        self._error: Exception | None = None
-        self._over = threading.Event()
-        self.thread = threading.Thread(target=self._run, name="simulated light", daemon=True)
-        self.thread.start()
-
-    def _run(self) -> None:
-        try:
-            self._seen = self._see()
-        except Exception as error:  # noqa: BLE001 - raised where the light is wanted
-            self._error = error
-        finally:
-            self._over.set()
-
-    def computed_s(self) -> float:
-        """Return how long the thread has computed, seconds of the processor; 0 where that is not said."""
-        try:
-            said = Path(f"/proc/self/task/{self.thread.native_id}/stat").read_text()
-        except OSError:  # over, or another system than Linux
-            return 0.0
-        return sum(map(int, said.rpartition(")")[2].split()[11:13])) / os.sysconf("SC_CLK_TCK")
-
-    def give_up(self) -> None:
-        """Let go of who waits; what is being computed is kept by the world."""
-        self._over.set()
-
-    def light(self) -> npt.NDArray[np.float32] | None:
-        """Wait for the light, or raise what kept it from being computed; None: it was given up."""
-        self._over.wait()
-        if self._error is not None:
-            raise self._error
-        return self._seen
 
 
 _LAST_LOOK_S = 5.0
@@ -122,7 +75,7 @@ class SimulatedCamera(SimulatedCameraSettings):
         self._lost = 0
         self._failure: DeviceError | None = None
         self._light: tuple[Any, npt.NDArray[np.float32]] | None = None
-        self._looks: list[_Look] = []
+        self._looks: list[Look] = []
         self._asked_s = 0.0
         self._coarse: tuple[Pixels, int] | None = None
         self._pattern: tuple[Any, FixedPattern] | None = None
@@ -426,7 +379,7 @@ class SimulatedCamera(SimulatedCameraSettings):
         if self._light is not None and self._light[0] == key:
             return self._light[1]
         self._looks = [look for look in self._looks if look.thread.is_alive()]
-        look = _Look(partial(self._look_at, self._region(), self._binning, self._filters()))
+        look = Look(partial(self._look_at, self._region(), self._binning, self._filters()))
         self._looks.append(look)
         total = None if self._abort.is_set() else look.light()
         if total is None:

@@ -290,14 +290,7 @@ def chart(family: Any, size: int, settings: Sequence[Mapping[str, Any]], counts:
     from recon.evaluation.trial import Setting
 
     scene = make_scene(family, size=size)
-    problem = ChartProblem(
-        scene.measurement,
-        scene.calibration,
-        not scene.spec.is_picture,
-        scene.erasures,
-        scene.noise,
-        scene.truth,
-    )
+    problem = ChartProblem.of_scene(scene)
     scores = []
     for setting in settings:
         curve = problem.run(Setting(**setting), counts=counts)

@@ -18,15 +18,7 @@ from recon.types import Calibration
 
 
 def problem(family="sparse-picture", **changes):
-    scene = make_scene(family, size=32, **changes)
-    return ChartProblem(
-        scene.measurement,
-        scene.calibration,
-        not scene.spec.is_picture,
-        scene.erasures,
-        scene.noise,
-        scene.truth,
-    )
+    return ChartProblem.of_scene(make_scene(family, size=32, **changes))
 
 
 def test_scores_come_on_the_way_and_get_better():
