@@ -22,6 +22,7 @@ from instrument.reconstruction.options import InputOptions
 from instrument.reconstruction.patterned import PatternedRequest, forecast_patterned, prepare_patterned
 from recon import Calibration, Options
 from recon.base.metrics import psnr
+from tests.mocks.plain_camera import cast
 from tests.mocks.recordings import write_recording
 
 SHAPE = (24, 30)
@@ -39,17 +40,6 @@ def lights() -> np.ndarray:
     x = np.arange(SHAPE[1]) / SHAPE[1] * 3 - np.arange(3)[:, None] - 0.5
     bands = np.exp(-(x**2) / 0.4) * np.array([1.0, 0.6, 0.9])[:, None]
     return np.repeat(bands[:, None], SHAPE[0], axis=1)
-
-
-def cast(light: np.ndarray) -> np.ndarray:
-    """What light of the sensor's field casts, by plain shifts and sums."""
-    response, image = psf(), np.zeros(SHAPE)
-    for row, column in np.argwhere(light > 0):
-        dy, dx = row - SHAPE[0] // 2, column - SHAPE[1] // 2
-        there = np.s_[max(dy, 0) : SHAPE[0] + min(dy, 0), max(dx, 0) : SHAPE[1] + min(dx, 0)]
-        here = np.s_[max(-dy, 0) : SHAPE[0] + min(-dy, 0), max(-dx, 0) : SHAPE[1] + min(-dx, 0)]
-        image[there] += light[row, column] * response[here]
-    return image
 
 
 def scene() -> np.ndarray:
@@ -71,7 +61,7 @@ def write_run(
     row, column = np.indices(SHAPE)
     sees = np.array(tint)[(row % 2) + (column % 2)] if tint else 1.0
     for number, light in enumerate(lights(), start=1):
-        clean = 20000 * sees * cast(reflects * light) + DARK_COUNTS
+        clean = 20000 * sees * cast(reflects * light, psf()) + DARK_COUNTS
         frames[number] = clean + rng.normal(0, 1, SHAPE)
     frames = {index: np.clip(np.round(frame), 0, 65535) for index, frame in frames.items()}
     plan = illumination_plan(group_lights(groups), exposure_ms=10)
@@ -183,7 +173,7 @@ def test_patterns_are_the_shares_of_the_light(files: tuple[Path, Path, Path]) ->
     assert np.abs(np.asarray(prepared.measurement.patterns) - truth)[middle].mean() < 0.06
     assert np.asarray(prepared.measurement.patterns).sum(axis=0)[5:-5, 5:-5] == pytest.approx(1, abs=1e-5)
     first = float(np.asarray(prepared.measurement.image)[0].mean())
-    assert abs(first - 20000 * float(cast(scene() * lights()[0]).mean())) < 5
+    assert abs(first - 20000 * float(cast(scene() * lights()[0], psf()).mean())) < 5
     binned = prepare_patterned(replace(request, inputs=InputOptions(binning=2))).measurement
     assert np.shape(binned.image) == np.shape(binned.patterns) == (3, 12, 15)
 

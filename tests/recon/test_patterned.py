@@ -11,6 +11,7 @@ from recon.camera.base import estimate_norm
 from recon.camera.convolution import Convolution
 from recon.camera.factors import PatternedCamera
 from recon.reconstruction.result import window_of
+from tests.mocks.plain_camera import cast
 
 SHAPE = (24, 30)
 
@@ -33,17 +34,6 @@ def patterns(count: int) -> np.ndarray:
     return np.repeat(bands[:, None], SHAPE[0], axis=1)
 
 
-def cast(light: np.ndarray) -> np.ndarray:
-    """What a scene of the sensor's field casts, by plain shifts and sums."""
-    response, image = psf(), np.zeros(SHAPE)
-    for row, column in np.argwhere(light > 0):
-        dy, dx = row - SHAPE[0] // 2, column - SHAPE[1] // 2
-        there = np.s_[max(dy, 0) : SHAPE[0] + min(dy, 0), max(dx, 0) : SHAPE[1] + min(dx, 0)]
-        here = np.s_[max(-dy, 0) : SHAPE[0] + min(-dy, 0), max(-dx, 0) : SHAPE[1] + min(-dx, 0)]
-        image[there] += light[row, column] * response[here]
-    return image
-
-
 def scene() -> np.ndarray:
     light = np.random.default_rng(1).random(SHAPE) * 0.2 + 0.2
     light[6:12, 5:9], light[14:18, 15:26] = 1.0, 0.7
@@ -60,7 +50,7 @@ def test_adjoint_norm_and_the_plain_sum() -> None:
     assert brighter.norm_bound == pytest.approx(3 * camera.norm_bound)
     inside = np.zeros(camera.domain_shape)
     inside[0, 0][camera.window] = scene()
-    expected = [cast(scene() * pattern) for pattern in patterns(3)]
+    expected = [cast(scene() * pattern, psf()) for pattern in patterns(3)]
     np.testing.assert_allclose(camera.forward(inside), expected, rtol=1e-5)
 
 
@@ -69,7 +59,7 @@ def test_one_pattern_of_ones_is_the_ordinary_camera() -> None:
     x = np.random.default_rng(3).random(Convolution(psf()[None], SHAPE).domain_shape, np.float32)
     plain = Convolution(psf()[None], SHAPE).forward(x)
     np.testing.assert_allclose(camera_of(ones, np.float32).forward(x[:, None]), plain, rtol=1e-4)
-    measured = cast(scene())
+    measured = cast(scene(), psf())
     settings = {"iterations": 150, "tau": 1e-3, "noise": 1.0, "prior": "tv-haar"}
     together = reconstruct(Measurement(measured[None], patterns=ones), psf(), **settings)
     alone = reconstruct(measured, psf(), solver="fista", tolerance=0, **settings)
@@ -81,7 +71,7 @@ def test_more_patterns_of_the_same_light_give_a_better_picture() -> None:
     found = []
     for count in (1, 6):
         lit = patterns(count)
-        clean = np.stack([cast(scene() * pattern) for pattern in lit])
+        clean = np.stack([cast(scene() * pattern, psf()) for pattern in lit])
         counts = rng.poisson(clean * 2000 / clean.sum(axis=0).max()) / 2000 * clean.sum(axis=0).max()
         picture = reconstruct(Measurement(counts, patterns=lit), psf(), iterations=200).image
         gain = float(np.vdot(picture, scene()) / np.vdot(picture, picture))
@@ -107,7 +97,7 @@ def test_what_does_not_fit_is_refused(frames: np.ndarray, lit: np.ndarray, says:
 
 def test_patterned_light_is_a_camera_and_goes_with_what_other_cameras_go_with() -> None:
     lit = patterns(3)
-    frames = np.stack([cast(scene() * pattern) for pattern in lit]) + 50.0
+    frames = np.stack([cast(scene() * pattern, psf()) for pattern in lit]) + 50.0
     plain = reconstruct(Measurement(frames, background=50.0, patterns=lit), psf(), iterations=60)
     assert plain.solver == "fista"
     problem = Problem.of(Measurement(frames, background=50.0, patterns=lit), psf())
@@ -130,8 +120,8 @@ def test_patterned_light_is_a_camera_and_goes_with_what_other_cameras_go_with() 
 
 def test_colours_are_seen_under_the_same_patterns() -> None:
     lit, tint = patterns(3), np.array([1.0, 0.5, 0.2])
-    plain = np.stack([cast(scene() * pattern) for pattern in lit])
-    mirrored = np.stack([cast(scene()[:, ::-1] * pattern) for pattern in lit])
+    plain = np.stack([cast(scene() * pattern, psf()) for pattern in lit])
+    mirrored = np.stack([cast(scene()[:, ::-1] * pattern, psf()) for pattern in lit])
     frames = np.stack([plain, mirrored, plain], axis=-1) * tint
     told = {"noise": 1e-3, "patterns": lit}
     found = reconstruct(Measurement(frames, **told), psf(), iterations=150)
