@@ -20,7 +20,7 @@ import numpy.typing as npt
 import tifffile
 
 from instrument.files import reading
-from instrument.files.atomic import whole_file, write_text
+from instrument.files.atomic import protect, whole_file, write_text
 from instrument.files.decoding import decode, depths_beside
 from instrument.files.errors import BenchError, FileError
 from instrument.files.image_folders import images_in, in_order, order_in_words
@@ -241,6 +241,7 @@ def image_metadata(path: Path) -> dict[str, Any]:
                 said |= _times(tiff)
                 text = (tiff.imagej_metadata or {}).get("Info") or page.description
         else:
+            protect(side_car(path))
             text = reading.read_bytes(side_car(path)).decode()
         metadata = reading.parse_json(text)
     except (OSError, ValueError, TypeError, FileError, tifffile.TiffFileError):

@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from instrument.files.atomic import protect
 from instrument.files.errors import FileError
 from instrument.files.record import value_of
 from instrument.reconstruction.job import MEASUREMENT, PSFS, prepared_record
@@ -69,6 +70,8 @@ def made_of(result: StoredResult) -> MadeOf:
     inputs = _options_of(result.path, told[READ_WITH])
     image = _there(_named(told["image"].get("path"), told["image"]), result.path)
     psfs = _there(_named(told["calibration"], told.get(PSF_STACK)), result.path)
+    read = (image, psfs, inputs.dark, inputs.erasures)
+    protect(*(Path(str(file).partition("::")[0]) for file in read if isinstance(file, Path)))
     job = volume_job(psfs, image, inputs)
     pixels, then = told["image"].get("pixels_sha256"), told.get(PREPARED)
     then, now = then if isinstance(then, Mapping) else {}, prepared_record(job)

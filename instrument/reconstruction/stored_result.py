@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from instrument.files.atomic import refuse_input, whole_file
+from instrument.files.atomic import protect, refuse_input, whole_file
 from instrument.files.calibration_file import load_calibration, save_calibration
 from instrument.files.decoding import require_npy
 from instrument.files.errors import FileError, size
@@ -303,6 +303,7 @@ def open_result(path: Path | str) -> StoredResult:
     Raises FileError when it is none, or its record is damaged.
     """
     path = _data_file(Path(path))
+    protect(path, record_file(path))
     record = _read_record(record_file(path))
     if is_zarr_name(path) or path.is_dir() or _is_volume(path, record):
         return StoredResult(path, None, open_volume(path), record)
@@ -317,6 +318,7 @@ def _beside(path: Path, name: str | None) -> npt.NDArray[np.float32] | None:
     beside = path.with_name(Path(str(name)).name)
     if name is None or not beside.is_file():
         return None
+    protect(beside)
     return np.asarray(read_image(beside).pixels, np.float32)
 
 

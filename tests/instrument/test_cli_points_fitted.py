@@ -60,6 +60,14 @@ def test_places_are_fitted_to_the_photograph_that_the_record_names(
     assert list(csv.DictReader(out.read_text().splitlines())) == rows[:1], "told are fewer, fitted all"
     capsys.readouterr()
     out.unlink()
+    # What the volume is told and made of by is an input, too.
+    read = [tmp_path / name for name in ("v.json", "photo.tif", "cal/calibration.json")]
+    before = [path.read_bytes() for path in read]
+    (tmp_path / "hard.tif").hardlink_to(tmp_path / "photo.tif")
+    for into in (*read, tmp_path / "hard.tif"):
+        assert main(["points", str(made), "--fit", "--out", str(into), "--force"]) == 2
+        assert "replaces" in " ".join(capsys.readouterr().err.split())
+    assert [path.read_bytes() for path in read] == before
     # Another photograph by now, none, and a record that does not tell which.
     fit = ["points", str(made), "--fit", "--out", str(out)]
     tifffile.imwrite(tmp_path / "photo.tif", photograph(2.0) + 100)

@@ -14,7 +14,7 @@ from recon.camera.convolution import Convolution
 from recon.camera.factors import BackgroundRemoval
 from recon.camera.varying_psfs import FieldOfPsfs, local_convolution
 from recon.priors import L1, Box, NonNegativity, TotalVariation
-from recon.solvers import tv_admm_volume, volume_admm
+from recon.solvers import _volume_kernels, tv_admm_volume, volume_admm
 from recon.solvers.douglas_rachford import DouglasRachford, SparseDouglasRachford
 from recon.solvers.operator_admm import LEAST_PIXELS, OperatorAdmm
 from recon.solvers.prior_splits import balancing
@@ -262,6 +262,20 @@ def test_compiled_sweeps_are_the_same_iterations(planes: int, isotropic: bool, s
         for _ in range(2):
             solver.advance()
     np.testing.assert_allclose(compiled.solution, plain.solution, atol=1e-8)
+
+
+@pytest.mark.usefixtures("many_threads")
+def test_kernels_stay_within_what_they_are_handed(monkeypatch: pytest.MonkeyPatch) -> None:
+    """As plain Python, which looks whether an index is within its array; compiled they write behind it."""
+    for name, kernel in vars(_volume_kernels).copy().items():
+        if hasattr(kernel, "py_func") and kernel.__module__ == _volume_kernels.__name__:
+            monkeypatch.setattr(_volume_kernels, name, kernel.py_func)
+    plain = LeanTotalVariation(CAMERA, SensorData(DATA, VALID), volume_tv(True) + NonNegativity())
+    plain.advance()
+    monkeypatch.undo()
+    compiled = LeanTotalVariation(CAMERA, SensorData(DATA, VALID), volume_tv(True) + NonNegativity())
+    compiled.advance()
+    np.testing.assert_allclose(plain.solution, compiled.solution, atol=1e-12)
 
 
 def test_a_device_is_asked_for_the_memory_of_all_volumes(monkeypatch: pytest.MonkeyPatch) -> None:
