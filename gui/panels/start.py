@@ -38,7 +38,7 @@ _TRIED = {
     ),
     "screen": (
         "Try a screen",
-        "A simulated camera before a monitor: calibrate by pictures on it",
+        "A simulated monitor before the camera: calibrate by pictures",
         "PSF from photographs of known pictures, without a stage",
     ),
 }
