@@ -95,7 +95,7 @@ class ProcedurePanel(Panel):
         self._left = NewestOnly(self.jobs, "Looking for runs that did not end")
         self._offered: tuple[Path | None, str] = (None, "")
         """A run of an earlier day that did not end, and its routine's name."""
-        self._result: Path | None = None
+        self._way_on: tuple[str, object] | None = None
         yield
         left, self.right = QWidget(), QWidget()
         """For the subclass."""
@@ -292,6 +292,12 @@ class ProcedurePanel(Panel):
     def looked(self, now: Situation) -> None:
         """Show the situation on the right; for subclasses."""
 
+    def way_from(self, outcome: Outcome) -> tuple[str, object] | None:
+        """Return which panel goes on from here, and with what; None: no way leads on."""
+        pictures = [file for file in outcome.files if file.suffix == ".tif"]
+        result = outcome.calibration or next(iter(pictures), None)
+        return None if result is None else (self.handed_to, result)
+
     def finished(self, outcome: Outcome) -> None:
         """Show a result on the right; for subclasses."""
 
@@ -376,7 +382,8 @@ class ProcedurePanel(Panel):
         self.session.handed_on.emit("start", self.routine.tried_on)
 
     def _use(self) -> None:
-        self.session.handed_on.emit(self.handed_to, self._result)
+        if self._way_on is not None:
+            self.session.handed_on.emit(*self._way_on)
 
     def resume(self, run: Path) -> None:
         """Go on with a run that did not end, here."""
@@ -409,9 +416,8 @@ class ProcedurePanel(Panel):
             runs = [runs[0], f"and {count(len(runs) - 1, 'run')} after it"]
         where = [*runs, *(str(path) for path in (outcome.calibration, *outcome.files) if path)]
         self._end_with("\n".join((*outcome.verdict, *where)), wrong=not outcome.good)
-        pictures = [file for file in outcome.files if file.suffix == ".tif"]
-        self._result = outcome.calibration or next(iter(pictures), None)
-        self.use_button.setVisible(self._result is not None)
+        self._way_on = self.way_from(outcome)
+        self.use_button.setVisible(self._way_on is not None)
         self.run_bar.show_end("Done" if outcome.good else "Done, with findings", complete=True)
         self.finished(outcome)
 

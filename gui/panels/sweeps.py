@@ -179,6 +179,12 @@ class SweepsPanel(ProcedurePanel):
             self._shown = now.newest
             self._show_frame(now.newest)
 
+    def way_from(self, outcome: Outcome) -> tuple[str, object] | None:
+        """Return where a calibration or photograph is used, or the frames of patterned light."""
+        if self.routine is ILLUMINATION and outcome.runs:
+            return "tasks", ("patterned", {"run": outcome.runs[0]})
+        return super().way_from(outcome)
+
     def finished(self, outcome: Outcome) -> None:
         """Show the last judgement, or the routine's picture."""
         if isinstance(outcome.result, SweepCalibration):

@@ -17,7 +17,8 @@ from calibration_routines.psf.sweep_procedure import SweepProcedure
 from drivers.errors import DeviceError
 from gui.main_window import MainWindow
 from gui.panels.runs import RunsPanel
-from gui.panels.sweeps import SweepsPanel
+from gui.panels.sweeps import ILLUMINATION, SweepsPanel
+from gui.panels.tasks import TasksPanel
 from gui.procedure_run import Ended, Situation
 from gui.widgets.tab_order import stops_of
 from instrument.bench.safety import MOTION_DOUBT
@@ -480,3 +481,22 @@ def test_another_routines_form_is_made_while_the_window_answers(
     qtbot.waitUntil(panel.run_bar.start_button.isEnabled, timeout=WAIT_MS)
     panel.choice.setCurrentIndex(panel.choice.findText("Bead slides"))
     assert panel.view.values() is not None, "whole for who asks"
+
+
+def test_frames_of_patterned_light_lead_to_their_picture_in_files(
+    qtbot: QtBot, window: MainWindow, panel: SweepsPanel
+) -> None:
+    panel.choice.setCurrentIndex(list(panel.routines).index(ILLUMINATION))
+    qtbot.waitUntil(lambda: panel.views.is_whole("illumination"), timeout=WAIT_MS)
+    panel.view.set_values({"lattice": 1, "exposure_ms": 5.0})
+    qtbot.waitUntil(panel.run_bar.start_button.isEnabled, timeout=WAIT_MS)
+    with qtbot.waitSignal(panel.run.over, timeout=WAIT_MS):
+        press(qtbot, panel.run_bar.start_button)
+    assert panel.use_button.isVisible()
+    press(qtbot, panel.use_button)
+    qtbot.waitUntil(lambda: "tasks" in window.maker.panels, timeout=WAIT_MS)
+    tasks = window.maker.panels["tasks"]
+    assert isinstance(tasks, TasksPanel)
+    qtbot.waitUntil(lambda: "patterned" in tasks._pages and not tasks._given, timeout=WAIT_MS)
+    (run,) = window.session.runs_folder.glob("*active-illumination")
+    assert tasks._pages["patterned"].form.value("run") == run
