@@ -33,6 +33,10 @@ _LINEAR_PX = 0.4  # a picture moves so far as its gradient tells; beyond, it is 
 _SLOPE = np.array([-1, 9, -45, 0, 45, -9, 1], np.float32) / 60
 """A derivative of sixth order: the usual one of second order takes fine structure for flatter than it is."""
 _UNLIKE = 0.3  # part of an image's contrast that a fit leaves: beyond, it is looked for elsewhere
+_STRANGE = 0.75  # part of the contrast left, of images that noise parts, beyond which chance gives places
+_GRAINS = 1.5  # what is left is noise's where it is at most so many times the two images' grain
+_SPLINE_PX = 3
+_COARSE_PX = 64  # short side of images that are made coarser
 _BORDER_PX = 8
 _POOR = 0.1  # part of its contrast that is left of a moved image
 _FLAT = 0.3  # contrast, relative to the mean, below which other light cannot be told from brightness
@@ -76,29 +80,67 @@ def reduction(image: npt.NDArray[np.floating]) -> int:
 
 
 def compare(image: Float, reference: Float) -> Change:
-    """Return how an image differs from a reference, (height, width) each, dark frames taken off."""
+    """Return how an image differs from a reference, (height, width) each, dark frames taken off.
+
+    Where grain hides what they have in common they are compared on larger pixels, too. A place at which less
+    than half of their structure is alike is none.
+    """
     factor = reduction(reference)
     seen, other = block_mean(image, factor), block_mean(reference, factor)
     if not other.mean() > 0 or not np.ptp(seen) > 0 or not np.ptp(other) > 0:
         return Change(float("nan"), float("nan"), float("nan"), float("nan"))
+    found, left = _compared(seen, other)
+    best = _in_pixels(found, factor)
+    while left > _UNLIKE and min(other.shape) >= _COARSE_PX and left**2 < _GRAINS * _grain(seen, other):
+        factor, seen, other = 2 * factor, block_mean(seen, 2), block_mean(other, 2)
+        found, coarser = _compared(seen, other)
+        if coarser < left:
+            best, left = _in_pixels(found, factor), coarser
+    return best if left <= _STRANGE else replace(best, rows=float("inf"), columns=float("inf"))
+
+
+def _compared(seen: Float, other: Float) -> tuple[Change, float]:
+    """Return how images differ, and the part of the contrast that is left where they lie on one another."""
     found, left = _fitted(seen, other)
-    if left > _UNLIKE or found.shift_px > _LINEAR_PX:
-        far = register(seen, other)
-        if far.reliable:
-            found, left = _fitted(moved(seen, -far.rows, -far.columns), other)
-            found = _with_place(found, found.rows + far.rows, found.columns + far.columns)
-            if left > _POOR:  # too fine to be moved by fractions of a pixel: all light together tells more
-                level = float(seen.sum(dtype=np.float64) / other.sum(dtype=np.float64))
-                found = replace(found, brightness=level, ambient=0.0)
-        elif left > _UNLIKE:
-            brightness = float(image.sum(dtype=np.float64) / reference.sum(dtype=np.float64))
-            return Change(brightness, float("inf"), float("inf"), 0.0)
-    return _with_place(found, factor * found.rows, factor * found.columns, factor * found.place_noise)
+    if left <= _UNLIKE and found.shift_px <= _LINEAR_PX:
+        return found, left
+    far = register(seen, other)
+    ways = far.rows, far.columns
+    if not far.reliable:
+        if left <= _UNLIKE:
+            return found, left
+        brightness = float(seen.sum(dtype=np.float64) / other.sum(dtype=np.float64))
+        return Change(brightness, float("inf"), float("inf"), 0.0), left
+    inner = tuple(slice(_rim(way, n), n - _rim(way, n)) for way, n in zip(ways, other.shape, strict=True))
+    back = moved(seen, -far.rows, -far.columns)
+    found, left = _fitted(back, other)
+    if left > _POOR:  # too fine to be moved by fractions of a pixel: all light together tells more
+        found, left = _fitted(back[inner], other[inner])
+        level = float(seen.sum(dtype=np.float64) / other.sum(dtype=np.float64))
+        found = replace(found, brightness=level, ambient=0.0)
+    return replace(found, rows=found.rows + far.rows, columns=found.columns + far.columns), left
 
 
-def _with_place(found: Change, rows: float, columns: float, noise: float | None = None) -> Change:
-    noise = found.place_noise if noise is None else noise
-    return replace(found, rows=rows, columns=columns, place_noise=noise)
+def _rim(way: float, side: int) -> int:
+    """Return the pixels at a border that nothing was moved into, with those that splines take from there."""
+    return min(int(np.ceil(abs(way))) + _SPLINE_PX, side // 4) if way else 0
+
+
+def _grain(*images: Float) -> float:
+    """Return the parts of images' variation, added up, that no pixel has in common with the next: noise."""
+    parts = 0.0
+    for image in images:
+        wide = image.astype(np.float64) - image.mean(dtype=np.float64)
+        parts += 1 - float(np.mean(wide[:, 1:] * wide[:, :-1])) / max(float(np.mean(wide**2)), 1e-300)
+    return parts
+
+
+def _in_pixels(found: Change, factor: int) -> Change:
+    """Return a change of pixels that were binned."""
+    if factor == 1:
+        return found
+    place = factor * found.rows, factor * found.columns
+    return replace(found, rows=place[0], columns=place[1], place_noise=factor * found.place_noise)
 
 
 def _fitted(seen: Float, other: Float) -> tuple[Change, float]:

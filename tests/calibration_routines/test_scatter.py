@@ -78,3 +78,16 @@ def test_a_lamp_that_flickers_is_not_said_to_drift_nor_is_its_flicker_taken_out_
     at = [shaky.brightness_at(t) for t in how[3]]
     assert np.diff(at, 2) == pytest.approx(np.zeros(3), abs=1e-9)
     assert np.ptp(at) < 0.15 < np.ptp(levels)
+
+
+@pytest.mark.parametrize(("contrast", "told"), [(0.1, True), (0.03, True), (0.01, False)])
+def test_structure_that_grain_hides_gets_its_place_or_none(contrast: float, told: bool) -> None:
+    """Weak and smooth, both images noisy, nothing moved: they were up to 3.5 pixels apart."""
+    rng = np.random.default_rng(0)
+    smooth = ndimage.gaussian_filter(rng.standard_normal((160, 240)), 6)
+    light = 1000 * (1 + contrast * smooth / smooth.std())
+    for _ in range(6):
+        one, other = (light + rng.normal(0, 30, (2, *light.shape))).astype(np.float32)
+        change = compare(one, other)
+        assert change.shift_px < 0.3 if told else change.shift_px == np.inf
+        assert change.brightness == pytest.approx(1, abs=0.01)
