@@ -294,7 +294,7 @@ def test_the_plan_command_writes_what_runs(tmp_path: Path, capsys: pytest.Captur
     assert "exists already" in capsys.readouterr().err
     both = ["plan", "illumination", "--exposure-ms", "1", "--groups", "1", "--lattice", "2"]
     assert main(both) == 2
-    assert "one of them" in capsys.readouterr().err
+    assert "as one of --groups, --lattice and --pattern" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(
