@@ -25,6 +25,7 @@ import numpy.typing as npt
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
+from benchmarks.measured_blind import blind
 from benchmarks.measured_variants import coarse_pairs, dark_levels, variants
 from benchmarks.uncertainty import measured_pairs_held
 from recon import Calibration, Reconstruction, reconstruct
@@ -273,6 +274,7 @@ SECTIONS: Mapping[str, tuple[str, Callable[[Path], list[str]]]] = {
     "usaf-full": ("The tilted USAF target, full size", lambda folder: usaf(folder, 1)),
     "pairs": ("The pairs", pairs),
     "variants": ("The hand as other files are", variants),
+    "blind": ("The hand as a stranger gives it", blind),
     "coarse": ("Pairs in coarse pixels", coarse_pairs),
     "dark": ("Pairs whose dark level is wrong", dark_levels),
     "intervals": ("How far the pairs' pictures may be off", intervals),
