@@ -315,10 +315,13 @@ def of_kind(value: Any, kind: Any, name: str = "") -> Any:
     which names the part, where it is of another kind.
     """
     if isinstance(kind, tuple):
-        for one in kind[:-1]:
-            if isinstance(value, one):
-                return value
-        return of_kind(value, kind[-1], name)
+        for one in kind:
+            # What is an object is told by what its own parts lack, all else by the kinds that it may be.
+            if isinstance(one, dict) and isinstance(value, Mapping):
+                return of_kind(value, one, name)
+            with contextlib.suppress(TypeError):
+                return of_kind(value, one, name)
+        raise TypeError(f"'{name}' is {str(value)[:40]!r}, {' and '.join(map(_no_such, kind))}")
     if isinstance(kind, dict):
         if not isinstance(value, Mapping):
             raise TypeError(f"'{name}' is no object of names and values")
@@ -337,10 +340,16 @@ def of_kind(value: Any, kind: Any, name: str = "") -> Any:
         return [of_kind(part, kind[0], name) for part in value]
     is_flag = isinstance(value, bool) and kind is not object
     if is_flag or not isinstance(value, (int, float) if kind is float else kind):
-        raise TypeError(f"'{name}' is {str(value)[:40]!r}, no {_WORDS[kind]}")
+        raise TypeError(f"'{name}' is {str(value)[:40]!r}, {_no_such(kind)}")
     if kind is float and isinstance(value, int) and abs(value) > sys.float_info.max:
         raise TypeError(f"'{name}' is a whole number of more than 300 digits")
     return value
 
 
 _WORDS = {float: "number", int: "whole number", str: "text"}
+
+
+def _no_such(kind: Any) -> str:
+    """Say that a value is not of a kind of :func:`of_kind`."""
+    structure = "no object of names and values" if isinstance(kind, dict) else "no list"
+    return f"no {_WORDS[kind]}" if isinstance(kind, type) else structure

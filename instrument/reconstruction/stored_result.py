@@ -38,7 +38,7 @@ from recon.verdict.judge import Region
 _HISTORY = [{"iteration!": float, "seconds!": float}]
 _TOLD: dict[str, Any] = {
     "inputs": {
-        "image": (str, {"path!": str, "taken": {"exposure_ms": (float, str)}}),
+        "image": (str, {"path!": str, "taken": {}}),
         "psf": (str, {"path!": str}),
         "calibration": str,
         "dark": {},
@@ -98,8 +98,8 @@ class StoredResult:
         words = []
         with contextlib.suppress(KeyError, ValueError):
             words.append(f"{datetime.fromisoformat(str(told['utc'])).astimezone():%Y-%m-%d %H:%M:%S}")
-        with contextlib.suppress(KeyError, ValueError):
-            words.append(f"{float(told['exposure_ms']):.4g} ms")
+        with contextlib.suppress(KeyError, ValueError):  # a photograph's file may say anything
+            words.append(f"{float(str(told['exposure_ms'])):.4g} ms")
         return ", ".join([*words, f"light: {told['light']}"] if "light" in told else words)
 
     @property

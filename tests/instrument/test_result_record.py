@@ -11,8 +11,11 @@ import numpy as np
 import pytest
 
 from instrument.files.errors import FileError
+from instrument.files.images import read_image, write_image
 from instrument.files.reading import parse_json
-from instrument.reconstruction.stored_result import open_result
+from instrument.files.record import of_kind
+from instrument.reconstruction.job import source_record
+from instrument.reconstruction.stored_result import _TOLD, open_result
 from instrument.volumes.grid_facts import grid_of
 from recon.base.marks import are_alike, marks_of
 
@@ -31,7 +34,7 @@ RNG = np.random.default_rng(4)
         (("verdict", "sentences"), "good", "'verdict.sentences' is no list"),
         (("warnings",), 3, "'warnings' is no list"),
         (("inputs", "image"), {"pixels": "a"}, "'inputs.image' has no 'path'"),
-        (("inputs", "image"), 3, "'inputs.image' is no object"),
+        (("inputs", "image"), 3, "'inputs.image' is '3', no text and no object of names and values"),
         (("tau",), "small", "'tau' is 'small', no number"),
         (("seconds",), True, "'seconds' is 'True', no number"),
         (("grid", "shape"), ["a"], "'grid.shape' is 'a', no whole number"),
@@ -56,6 +59,73 @@ def test_what_is_of_another_kind_is_named(
             assert says in str(caught.value)
         else:  # null is what is not known
             assert dict(open_result(tmp_path / "picture.tif").facts())["Size"]
+
+
+def numbers_of(kind: Any, *at: str | int) -> list[tuple[tuple[str | int, ...], Any]]:
+    """Every place of a table of kinds that may hold a number, and its kind."""
+    if isinstance(kind, tuple):
+        return [place for one in kind for place in numbers_of(one, *at)]
+    if isinstance(kind, dict):
+        return [place for key, one in kind.items() for place in numbers_of(one, *at, key.rstrip("!"))]
+    if isinstance(kind, list):
+        return numbers_of(kind[0], *at, 0)
+    return [(at, kind)] if kind in (int, float) else []
+
+
+def sound(kind: Any) -> Any:
+    """The least that is of a kind, with an item in each list."""
+    if isinstance(kind, tuple):
+        return sound(kind[-1])
+    if isinstance(kind, dict):
+        return {key.rstrip("!"): sound(one) for key, one in kind.items()}
+    return [sound(kind[0])] if isinstance(kind, list) else {float: 0.5, int: 1}.get(kind, "a")
+
+
+PLACES = numbers_of(_TOLD)
+
+
+@pytest.mark.parametrize(("place", "kind"), PLACES, ids=[".".join(map(str, place)) for place, _ in PLACES])
+def test_every_number_of_a_record_may_be_a_whole_one(
+    place: tuple[str | int, ...], kind: type, tmp_path: Path
+) -> None:
+    shutil.copyfile(RESULTS / "picture.tif", tmp_path / "picture.tif")
+    for value in (0, 10, -3, 10**20) if kind is float else (0, 10):
+        record = sound(_TOLD)
+        inside = record
+        for name in place[:-1]:
+            inside = inside[name]
+        inside[place[-1]] = value
+        (tmp_path / "picture.json").write_text(json.dumps(record))
+        told: Any = open_result(tmp_path / "picture.tif").record
+        for name in place:
+            told = told[name]
+        assert told == value
+
+
+def test_of_several_kinds_each_is_tried_and_all_are_named() -> None:
+    for value in (10, 10.5, "10"):
+        assert of_kind(value, (float, str), "a") == value
+    for wrong in (True, [], {}):
+        with pytest.raises(TypeError, match="no number and no text"):
+            of_kind(wrong, (float, str), "a")
+    with pytest.raises(TypeError, match=r"'a\.b' is 'c', no number"):
+        of_kind({"b": "c"}, (str, {"b": float}, float), "a")
+    with pytest.raises(TypeError, match="no list and no whole number"):
+        of_kind("a", ([int], int), "a")
+
+
+@pytest.mark.parametrize("exposure_ms", [10, 10.0, "10", [1, 2], True, {}, None])
+def test_a_result_of_a_photograph_that_says_anything_of_its_exposure_is_read(
+    exposure_ms: object, tmp_path: Path
+) -> None:
+    image = np.zeros((12, 16), np.uint16)
+    write_image(tmp_path / "photo.tif", image, {"exposure_ms": exposure_ms})
+    shutil.copyfile(RESULTS / "picture.tif", tmp_path / "picture.tif")
+    record = json.loads((RESULTS / "picture.json").read_text())
+    record["inputs"]["image"] = source_record(read_image(tmp_path / "photo.tif"))
+    (tmp_path / "picture.json").write_text(json.dumps(record))
+    told = dict(open_result(tmp_path / "picture.tif").facts()).get("Taken", "")
+    assert told == ("10 ms" if exposure_ms in (10, "10") and exposure_ms is not True else "")
 
 
 def test_numbers_that_are_no_sizes_are_not_known() -> None:
