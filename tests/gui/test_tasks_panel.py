@@ -97,7 +97,7 @@ def test_every_task_has_a_form_of_its_own_declarations(qtbot: QtBot, panel: Task
         offered = {o.name for _, options in panel._pages[name].task.parts.values() for o in options}
         assert {n for n in offered if n in form.fields} == set(form.fields)
         assert all(field.tip for field in form.fields.values())
-        qtbot.waitUntil(lambda form=form: not list(cut_off(form)), timeout=5000)  # a layout settles
+        qtbot.waitUntil(lambda form=form: not list(cut_off(form)), timeout=WAIT_MS)  # a layout settles
         told = [
             form.widgets[n].toolTip() + getattr(form.widgets[n], "placeholderText", str)()
             for n in form.fields
@@ -115,7 +115,7 @@ def test_every_task_has_a_form_of_its_own_declarations(qtbot: QtBot, panel: Task
     def inside_form() -> list[QWidget]:
         return [stop for stop in stops_of(panel) if form.isAncestorOf(stop)]
 
-    qtbot.waitUntil(lambda: len(inside_form()) > 1, timeout=5000)  # Qt shows new parts a turn later
+    qtbot.waitUntil(lambda: len(inside_form()) > 1, timeout=WAIT_MS)  # Qt shows new parts a turn later
     stops, inside = list(stops_of(panel)), inside_form()
     begins = stops.index(panel.choice) + 1
     assert stops[begins : begins + len(inside)] == inside, "Tab goes from the choice into the form"
@@ -325,7 +325,7 @@ def test_the_field_of_view_is_told_in_a_table_that_fits_a_small_screen(
     (table,) = panel.tables.findChildren(QTableWidget)
     assert table.columnCount() == 6
     form_px = panel.stack.width()
-    qtbot.waitUntil(lambda: table.isVisible() and not table.horizontalScrollBar().maximum(), timeout=5000)
+    qtbot.waitUntil(lambda: table.isVisible() and not table.horizontalScrollBar().maximum(), timeout=WAIT_MS)
     assert panel.stack.width() < form_px
     shown(qtbot, panel, "spots")
     assert panel.stack.width() == form_px, "it was lent until something else is shown"
