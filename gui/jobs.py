@@ -336,10 +336,10 @@ class JobRunner(QObject):
             if number not in self._waiting:
                 taken |= job.lanes
         for number in list(self._waiting):
-            if number not in self._waiting:
+            if number not in self._jobs:
                 continue  # withdrawn by what the start of one before it has led to
             job = self._jobs[number]
-            if not (job.lanes & taken):
+            if number in self._waiting and not (job.lanes & taken):
                 self._waiting.remove(number)
                 self._start(number, job)
             taken |= job.lanes  # who comes later does not overtake
@@ -351,8 +351,12 @@ class JobRunner(QObject):
         )
         # What the work holds (a recording's buffers) goes with its thread, not with whoever keeps the job.
         job._work = None
+        try:
+            thread.start()
+        except RuntimeError as error:  # the system has no more: its devices are for others
+            self._finish(number, "failed", error)
+            return
         self._threads = [*(t for t in self._threads if t.is_alive()), thread]
-        thread.start()
         job.started.emit()
         self.job_started.emit(job)
 

@@ -210,3 +210,37 @@ def test_a_start_may_withdraw_what_waits_behind_it(qtbot: QtBot, jobs: JobRunner
         pass
     assert second.state is JobState.CANCELLED
     assert jobs.jobs == ()
+
+
+def test_what_a_start_has_let_begin_holds_its_device(qtbot: QtBot, jobs: JobRunner) -> None:
+    """A withdrawal while jobs are started starts others: what comes behind those waits for them."""
+    gate = threading.Event()
+    first = jobs.device("first", lambda _: None, {"camera"})
+    second = jobs.device("second", lambda _: gate.wait(WAIT_MS / 1000), {"stage"})
+    third = jobs.device("third", lambda _: None, {"light"})
+    fourth = jobs.device("fourth", lambda _: None, {"stage"})
+    first.started.connect(lambda: jobs.withdraw(third))
+    together: list[JobState] = []
+    fourth.started.connect(lambda: together.append(second.state))
+    with qtbot.waitSignal(first.ended, timeout=WAIT_MS):
+        pass
+    gate.set()
+    qtbot.waitUntil(lambda: fourth.is_over, timeout=WAIT_MS)
+    assert together == [JobState.SUCCEEDED]
+
+
+def test_a_thread_that_cannot_be_had_fails_its_job_and_no_other(
+    qtbot: QtBot, jobs: JobRunner, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def none_left(_: threading.Thread) -> None:
+        raise RuntimeError("can't start new thread")
+
+    with monkeypatch.context() as without:
+        without.setattr(threading.Thread, "start", none_left)
+        job = jobs.device("first", lambda _: None, {"camera"})
+        with qtbot.waitSignal(job.ended, timeout=WAIT_MS):
+            pass
+    assert job.state is JobState.FAILED
+    later = jobs.device("second", lambda _: None, {"camera"})
+    with qtbot.waitSignal(later.succeeded, timeout=WAIT_MS):
+        pass
