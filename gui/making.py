@@ -97,6 +97,17 @@ class PanelMaker(QObject):
         job = self._session.jobs.watch(f"Opening {PANELS[name].title}", lambda _: PANELS[name].load())
         job.succeeded.connect(lambda _: self._begin(name))
         job.failed.connect(lambda why: self._failed(name, why))
+        job.cancelled.connect(lambda why: self._failed(name, why))  # as Ctrl-C does, wherever it comes from
+
+    def waits_for(self, name: str) -> str:
+        """Return what the opening of a panel waits for, in words; empty where it stands."""
+        if name in self.panels:
+            return ""
+        if name in self._slices:
+            return "its next slice"
+        if name in self._then:
+            return "the job that imports it"
+        return "the live view's first picture" if name in (self._later or ()) else "nothing: see the log"
 
     def ask_later(self, name: str) -> None:
         """Have a panel made that stands beside the live view, whose first picture comes before it."""
@@ -168,7 +179,7 @@ class PanelMaker(QObject):
 
     def _failed(self, name: str, why: str) -> None:
         self._slices.pop(name, None)
-        self._then.pop(name, None)
-        if name not in self.panels:
+        self._then.pop(name, None)  # it may be asked for again
+        if name not in self.panels and not self._session.is_closing:
             self._session.log("error", f"{PANELS[name].title}: {why}")
             self._places[name].hold(text_view(why))

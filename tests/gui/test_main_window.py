@@ -13,6 +13,7 @@ from PySide6.QtGui import QColor
 from PySide6.QtWidgets import QApplication, QLabel, QMessageBox, QWidget
 from pytestqt.qtbot import QtBot
 
+from benchmarks.gui_stalls import opened
 from calibration_routines.procedure import Outlook, Procedure
 from gui.jobs import JobContext, JobState
 from gui.main_window import MainWindow
@@ -423,3 +424,28 @@ def test_panels_are_prepared_before_they_are_asked_for(
     window.maker.prepare()
     qtbot.waitUntil(lambda: len(loaded) == len(PANELS), timeout=WAIT_MS)
     assert "lacks" not in window.job_label.text(), "it is told where the panel is opened"
+
+
+def test_an_import_that_is_broken_off_leaves_no_panel_opening_for_ever(
+    qtbot: QtBot, window: MainWindow, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def load(_: PanelEntry) -> None:
+        raise KeyboardInterrupt
+
+    opening = window.maker
+    with monkeypatch.context() as broken:
+        broken.setattr(PanelEntry, "load", load)
+        window.bring("holograms")
+        assert opening.waits_for("holograms") == "the job that imports it"
+        qtbot.waitUntil(lambda: "nothing" in opening.waits_for("holograms"), timeout=WAIT_MS)
+    window.bring("holograms")
+    qtbot.waitUntil(lambda: not opening.waits_for("holograms"), timeout=WAIT_MS)
+    assert "holograms" in opening.panels
+
+
+def test_the_benchmark_of_stalls_tells_of_a_panel_that_is_not_made(
+    window: MainWindow, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(PanelEntry, "load", lambda _: threading.Event().wait(1.0))
+    with pytest.raises(TimeoutError, match=r"Holograms does not stand.*the job that imports it.*Opening"):
+        opened(window, "holograms", 0.2)
