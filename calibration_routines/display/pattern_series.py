@@ -10,6 +10,8 @@ creeps, what grows, and whether mask and SLM are where they were against one ano
 * Place: what goes on from visit to visit is put back, by a straight line between two of them. What shakes is
   not known of a single photograph, and is said.
 * Size, and a pattern whose picture is another one, cannot be put back: a finding, or there is no result.
+* What frames of a visit have each of its own is noise, or a mask that shakes: nothing parts the two. It is no
+  other picture, and is noted.
 """
 
 from __future__ import annotations
@@ -42,6 +44,7 @@ from recon.holography.target import Band, make_band
 
 Float = npt.NDArray[np.float32]
 Floats = npt.NDArray[np.float64]
+Complexes = npt.NDArray[np.complex128]
 
 REFERENCE_EVERY = 4
 """About so many patterns between two visits to the reference."""
@@ -55,6 +58,11 @@ GROWN = 5e-4
 """Change of size that is a finding: half a pixel at the border of a field of two thousand."""
 OTHER = 0.3
 """Part of the reference's contrast that is another one's, beyond which nothing is learned."""
+_LOST = (
+    "The pattern that was shown again did not give its picture again: mask, SLM, lens or camera moved "
+    "meanwhile, or the light went. Clamp what moves, align the mask, lengthen the exposure where they are "
+    "noisy, and photograph again."
+)
 _SURE = 3.0  # standard deviations of a visit's place, as its frames shake
 
 
@@ -67,6 +75,14 @@ class Visit:
     """Share by which it is larger."""
     other: float = 0.0
     """Part of its contrast, squared, that is not the first visit's, wherever it lies: another picture."""
+    other_error: float = 0.0
+    """Of ``other``: standard deviation by noise."""
+    noise: float = 0.0
+    """Part of a frame's contrast, squared, that the other frames of the visit do not have."""
+
+    def is_other(self, bound: float) -> bool:
+        """Whether more than such a part is another picture's, and noise does not explain it."""
+        return self.other > bound + _SURE * self.other_error
 
 
 @dataclass(frozen=True, slots=True)
@@ -101,10 +117,16 @@ class PatternSeries:
         return max(visit.other for visit in self.visits)
 
     @property
+    def noise(self) -> float:
+        """Part of one frame's contrast, squared, that frames of the same visit do not share, on average."""
+        return float(np.mean([visit.noise for visit in self.visits]))
+
+    @property
     def findings(self) -> tuple[str, ...]:
         """What was not put back and changes what is learned, in words."""
         found = list(replace(self.scatter, frames=1, flicker=0.0, ambient=0.0).findings("photograph"))
-        step = max(float(np.hypot(*(_place(b) - _place(a)))) for a, b in pairwise(self.visits))
+        ways = [_place(b) - _place(a) for a, b in pairwise(self.visits)]
+        step = max((float(np.hypot(*way)) for way in ways), default=0.0)
         if step > STEP_PX + self._place_px:
             found.append(
                 f"the picture moved by {step:.1f} pixels between two visits to the same pattern (up to "
@@ -117,7 +139,7 @@ class PatternSeries:
                 f"{'larger' if self.grown > 0 else 'smaller'}: camera or lens moved along the axis. Clamp "
                 "them, and photograph again."
             )
-        if self.other > TOLERATED:
+        if any(visit.is_other(TOLERATED) for visit in self.visits):
             found.append(
                 f"the same pattern's picture became another one, by {self.other:.1%} of its contrast: the "
                 "mask moved against the SLM, or what the SLM does changed. Clamp the mask, let the SLM warm "
@@ -134,12 +156,19 @@ class PatternSeries:
                 f"the picture moved meanwhile, up to {self.crept_px:.2f} pixels from its first place: "
                 "photographs were put back by a pattern that was shown again and again"
             )
-        levels = [visit.change.brightness for visit in self.visits]
+        changes = [visit.change for visit in self.visits]
+        levels = [change.brightness for change in changes]
         drift = max(levels) - min(levels)
-        if max(drift, self.scatter.flicker) > TOLERATED:
+        drifts = drift > TOLERATED + _SURE * max(change.brightness_noise for change in changes)
+        if drifts or self.scatter.flicker > TOLERATED:
             told.append(
                 f"the light drifts by {drift:.1%} and flickers by {self.scatter.flicker:.1%} from frame to "
                 "frame: taken out, as each photograph's brightness is free"
+            )
+        if self.noise > TOLERATED:
+            told.append(
+                f"{self.noise:.1%} of a photograph's contrast is not in the next one of the same pattern: "
+                "noise, or a mask that shakes against the SLM; a longer exposure tells which"
             )
         return tuple(told)
 
@@ -147,7 +176,7 @@ class PatternSeries:
 def visited_before(count: int) -> list[int]:
     """Return before which of so many patterns, counted from 0, the reference is visited; the last: after."""
     intervals = max(1, round((count - 1) / REFERENCE_EVERY))
-    return [round(float(at)) for at in np.linspace(1, count, intervals + 1)]
+    return sorted({round(float(at)) for at in np.linspace(1, count, intervals + 1)})
 
 
 def series_frames(count: int) -> int:
@@ -166,6 +195,7 @@ def photograph_series(seen: HologramCamera, count: int, *, seed: int = 0) -> Pat
     band = make_band(shape, seen.display.factor, "alias-free")
     exposure_ms, first_frame, at = io.exposure_ms(seen.mean_per_ms), io.frames, visited_before(count)
     reference: Float | None = None
+    first: Complexes | None = None
     looks: list[Look] = []
     visits: list[Visit] = []
     scatters: list[Scatter] = []
@@ -176,21 +206,26 @@ def photograph_series(seen: HologramCamera, count: int, *, seed: int = 0) -> Pat
             steady = steadied(frames)
             scatters.append(steady.scatter)
             look = Look(patterns[0], seen.camera.lags(steady.mean, band))
+            each = [Look(patterns[0], seen.camera.lags(frame, band)) for frame in steady.frames]
+            change, grown = NO_CHANGE, 0.0
             if reference is None:
                 reference = steady.mean
                 looks.append(look)
-                visits.append(Visit(NO_CHANGE))
             else:
-                change = _required(compare(steady.mean, reference))
-                back = put_back([look], [(change.rows, change.columns)], seen.camera, band)[0]
-                other = _other(back.lags, looks[0].lags, band)
-                visits.append(Visit(change, _growth(steady.mean, reference, change), other))
+                change = compare(steady.mean, reference)
+                if not np.isfinite(change.shift_px):
+                    raise CalibrationError(_LOST)
+                grown = _growth(steady.mean, reference, change)
+                each = list(put_back(each, [(change.rows, change.columns)] * len(each), seen.camera, band))
+            lags = _counted(each, band)
+            first = lags if first is None else first
+            visits.append(_visit(change, grown, lags, first))
         if number < count:
             io.show(patterns[number])
             looks.append(Look(patterns[number], seen.camera.lags(io.photograph(exposure_ms), band)))
     series = PatternSeries(tuple(looks), io.frames - first_frame, tuple(visits), pooled(scatters))
-    if series.other > OTHER:
-        _required(None)
+    if any(visit.is_other(OTHER) for visit in series.visits):
+        raise CalibrationError(_LOST)
     if series.crept_px:
         series = replace(series, looks=put_back(looks, _places(visits, at, count), seen.camera, band))
     return series
@@ -223,29 +258,40 @@ def _places(visits: Sequence[Visit], at: Sequence[int], count: int) -> Floats:
     return np.array([np.interp(photographed, visited, way) for way in ways]).T
 
 
-def _required(change: Change | None) -> Change:
-    """Return a change of the same picture, else raise."""
-    if change is None or not np.isfinite(change.shift_px):
-        raise CalibrationError(
-            "The pattern that was shown again did not give its picture again: mask, SLM, lens or camera "
-            "moved meanwhile, or the light went. Clamp what moves, align the mask, and photograph again."
-        )
-    return change
-
-
 def _growth(mean: Float, reference: Float, change: Change) -> float:
     factor = reduction(reference)
     seen, other = block_mean(mean, factor), block_mean(reference, factor)
     return growth(moved(seen, -change.rows / factor, -change.columns / factor), other)
 
 
-def _other(
-    lags: npt.NDArray[np.complexfloating], first: npt.NDArray[np.complexfloating], band: Band
-) -> float:
-    """Return the part of a picture's power that is not the first one's; brightness is free."""
+def _counted(looks: Sequence[Look], band: Band) -> Complexes:
+    """Return the coefficients that an eye resolves, the mean's apart, (n_looks, n)."""
     y, x = band.lags()
     radius = np.hypot(y[:, None], x)
-    counted = (radius > 0) & (radius <= band.cutoff)
-    one, other = lags[counted], first[counted]
-    powers = float(np.vdot(one, one).real) * float(np.vdot(other, other).real)
-    return max(0.0, 1 - float(np.vdot(other, one).real) ** 2 / powers)
+    return np.array([look.lags[(radius > 0) & (radius <= band.cutoff)] for look in looks])
+
+
+def _visit(change: Change, grown: float, lags: Complexes, first: Complexes) -> Visit:
+    """Return what is known of a visit: from the coefficients of its frames and of the first's, (n_frames, n).
+
+    A power is that which frames share: noise, which they do not, is no other picture. Brightness, too, is by
+    that: a fit of one noisy image to another takes it for less.
+    """
+    (seen, shared), (_, reference) = _powers(lags), _powers(first)
+    if not shared > 0 or not reference > 0:
+        raise CalibrationError(_LOST)
+    alike = float(np.vdot(first.mean(axis=0), lags.mean(axis=0)).real)
+    other = 0.0 if lags is first else max(0.0, 1 - alike * abs(alike) / (shared * reference))
+    n_frames, n = lags.shape
+    in_mean = max(0.0, seen / shared - 1) / n_frames
+    error = in_mean * float(np.sqrt((2 + 2 * n_frames / (n_frames - 1)) / n))
+    level, level_error = float(np.sqrt(shared / reference)), float(np.sqrt(in_mean / n))
+    change = replace(change, brightness=level, brightness_noise=level_error)
+    return Visit(change, grown, other, error, max(0.0, 1 - shared / seen))
+
+
+def _powers(lags: Complexes) -> tuple[float, float]:
+    """Return a frame's power, and the part of it that it shares with each of the others, (n_frames, n)."""
+    together, each = float(np.sum(np.abs(lags.sum(axis=0)) ** 2)), float(np.sum(np.abs(lags) ** 2))
+    n = len(lags)
+    return each / n, (together - each) / (n * (n - 1))

@@ -43,8 +43,10 @@ COUNT = 9
 class Io:
     """Shows the mask's far field; what is wrong with it goes by how many patterns were shown."""
 
-    def __init__(self, wrong: Callable[[int, Array], Array], mask: Callable[[int], Array]) -> None:
-        self.frames, self._shown, self._wrong, self._mask = 0, 0, wrong, mask
+    def __init__(
+        self, wrong: Callable[[int, Array], Array], mask: Callable[[int], Array], noise: float
+    ) -> None:
+        self.frames, self._shown, self._wrong, self._mask, self._of_noise = 0, 0, wrong, mask, noise
         self._slm: Array = np.ones(SHAPE)
         self._noise = np.random.default_rng(8)
 
@@ -60,7 +62,7 @@ class Io:
         light = np.abs(np.fft.fftshift(np.fft.fft2(field, (ACROSS, ACROSS)))) ** 2
         light = np.pad(self._wrong(self._shown, light / light.mean()), RIM, mode="wrap")
         self.frames += 1
-        return light + 0.01 * self._noise.standard_normal(light.shape)
+        return light + self._of_noise * self._noise.standard_normal(light.shape)
 
 
 def moved_by(light: Array, rows: float, columns: float) -> Array:
@@ -72,10 +74,12 @@ def moved_by(light: Array, rows: float, columns: float) -> Array:
 def series(
     wrong: Callable[[int, Array], Array] = lambda _, light: light,
     mask: Callable[[int], Array] = lambda _: MASK,
+    noise: float = 0.01,
+    count: int = COUNT,
 ) -> PatternSeries:
     camera = CameraMap((ACROSS + 2 * RIM,) * 2, ACROSS, np.zeros((10, 2)))
-    seen = SimpleNamespace(io=Io(wrong, mask), display=DISPLAY, camera=camera, mean_per_ms=1.0)
-    return photograph_series(seen, COUNT)  # type: ignore[arg-type]
+    seen = SimpleNamespace(io=Io(wrong, mask, noise), display=DISPLAY, camera=camera, mean_per_ms=1.0)
+    return photograph_series(seen, count)  # type: ignore[arg-type]
 
 
 def apart(one: PatternSeries, other: PatternSeries) -> float:
@@ -138,6 +142,27 @@ def test_a_mask_that_moves_against_the_slm_is_a_finding_or_the_end() -> None:
         series(mask=lambda shown: MASK if shown < 8 else aside)
     a_little = series(mask=lambda shown: MASK if shown < 8 else MASK + 0.25 * aside)
     assert "became another one" in " ".join(a_little.findings)
+
+
+@pytest.mark.parametrize("noise", [0.8, 2.0])
+def test_noise_is_no_other_picture_and_hides_none(noise: float) -> None:
+    grainy = series(noise=noise)
+    assert grainy.findings == ()
+    words = " ".join(grainy.notes)
+    assert "of a photograph's contrast is not in the next one of the same pattern: noise" in words
+    assert "drifts" not in words
+    aside = np.roll(MASK, 1, axis=1)
+    other = series(mask=lambda shown: MASK if shown < 8 else MASK + 0.25 * aside, noise=noise)
+    still = series(mask=lambda shown: MASK if shown < 8 else MASK + 0.25 * aside)
+    assert "became another one" in " ".join(other.findings)
+    assert other.other == pytest.approx(still.other, abs=0.01 if noise < 1 else 0.08)
+
+
+def test_one_pattern_is_visited_once_and_nothing_is_found() -> None:
+    assert visited_before(1) == [1]
+    alone = series(count=1)
+    assert (alone.frames, len(alone.looks)) == (series_frames(1), 1)
+    assert (alone.findings, alone.notes) == ((), ())
 
 
 def test_what_is_learned_of_a_picture_that_shook_is_doubtful_and_says_so(
