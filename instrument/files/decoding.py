@@ -1,18 +1,23 @@
-"""Decoding what an image file holds, to a plain array: TIFF, PNG, JPEG, BMP, NumPy, HDF5, MATLAB."""
+"""Decoding what an image file holds, to a plain array: TIFF, PNG, JPEG, BMP, NumPy, HDF5, MATLAB.
+
+And where the images of a stack lie, by arrays beside it, its side-car or its format: one check for all.
+"""
 
 from __future__ import annotations
 
+import contextlib
 import io
 import math
 import zipfile
 import zlib
+from collections.abc import Mapping
 from pathlib import Path
 from typing import IO, Any
 
 import numpy as np
 import numpy.typing as npt
 
-from instrument.files import reading
+from instrument.files import matlab, reading
 from instrument.files.errors import FileError, os_reason, size
 from instrument.files.named_arrays import Expect, is_hdf5, is_matlab, outline, read_hdf5, read_matlab
 from instrument.files.pictures import MAGIC, READABLE, Decoded, decode_picture
@@ -112,35 +117,6 @@ def decode(path: Path, inside: str, expect: Expect) -> Decoded:
     return decode_picture(path)
 
 
-_DEPTHS_UM = {
-    f"{what}_{unit}": um for what in ("depths", "depth", "z") for unit, um in (("um", 1.0), ("mm", 1e3))
-}
-"""Names of arrays that tell where the images of their file's stack lie, and their unit."""
-
-
-def depths_beside(path: Path, count: int) -> list[float]:
-    """Return where so many images lie, as an array of their HDF5, MATLAB or .npz file tells by its name.
-
-    Micrometres; empty where none does.
-    """
-    with path.open("rb") as file:
-        beginning = file.read(_BEGINNING)
-    if not (is_hdf5(beginning) or is_matlab(beginning) or beginning.startswith(b"PK")):
-        return []
-
-    def of_each(told: npt.NDArray[Any]) -> None:
-        if told.size != count:
-            raise FileError(path, "tells of other images.")
-
-    for name, um in _DEPTHS_UM.items():
-        try:
-            told, _ = decode(path, name, of_each)
-        except FileError:
-            continue
-        return [um * float(z) for z in told.ravel()]
-    return []
-
-
 def require_npy(path: Path) -> None:
     """Refuse an array of NumPy's that is damaged, or says to be far more than its file holds.
 
@@ -153,7 +129,10 @@ def require_npy(path: Path) -> None:
 
 
 def _npy_outline(path: Path, file: IO[bytes], n_bytes: int) -> npt.NDArray[Any]:
-    """Read a .npy header; return the outline of what it says follows in the file's ``n_bytes``."""
+    """Read a .npy header; return the outline of what it says follows in the file's ``n_bytes``.
+
+    Raises FileError.
+    """
     try:
         version = np.lib.format.read_magic(file)
         length = file.read(2 if version == (1, 0) else 4)
@@ -228,3 +207,151 @@ def _decode_npz(path: Path, inside: str, expect: Expect) -> Decoded:
         raise FileError(path, f"is no .npz with one plain array: {error}.") from None
     except (NotImplementedError, RuntimeError) as error:  # another compression, a password
         raise FileError(path, f"is no .npz with one plain array: {error}.") from None
+
+
+# Where the images of a stack lie --------------------------------------------------------------------
+_UNITS_UM = {
+    f"{what}_{unit}": um for what in ("depths", "depth", "z") for unit, um in (("um", 1.0), ("mm", 1e3))
+}
+"""Names of arrays that tell where the images of their file's stack lie, and their unit."""
+
+_KINDS = {"b": "booleans", "c": "complex numbers", "U": "text", "S": "text", "O": "objects of Python's"}
+_OF_FORMAT = "depths_um of its metadata"
+_SAME = 1e-6
+"""Depths that agree to this part of the farthest are the same: single precision, millimetres."""
+
+
+class DepthsError(FileError):
+    """An array that tells where images lie does not."""
+
+
+def tells_depths(path: Path) -> bool:
+    """Whether an array of an HDF5, MATLAB or .npz file tells by its name where images lie."""
+    return not _UNITS_UM.keys().isdisjoint(_shapes(path))
+
+
+def depths_told(path: Path, count: int, of_format: Any) -> tuple[list[float], tuple[str, ...]]:
+    """Return where so many images of a stack lie, micrometres, and what to say; empty where nothing tells.
+
+    ``of_format`` is what the file's format, or its side-car, tells as ``depths_um``; what cannot be taken of
+    it is said, as who has the file seldom wrote it. Arrays of an HDF5, MATLAB or .npz file tell by their
+    names; one of as many depths as another stack of the file has images is of that stack. A depth may be 0 or
+    below, and twice the same, as a stage counts: who takes depths for distances looks at that.
+
+    Raises DepthsError where an array has another number of depths, or anything but finite real numbers,
+    or two disagree.
+    """
+    if count < 2:
+        return [], ()
+    said: tuple[str, ...] = ()
+    found: dict[str, list[float]] = {}
+    shapes = _shapes(path)
+    n_told = len(of_format) if isinstance(of_format, list) else int(of_format is not None)
+    if n_told and not _of_another_stack(n_told, shapes, count):
+        try:
+            found[_OF_FORMAT] = _checked(path, _OF_FORMAT, of_format, count)
+        except DepthsError as error:
+            said = (f"{error.problem.rstrip('.')}: not taken",)
+    for name, um in _UNITS_UM.items():
+        n_told = math.prod(shapes.get(name, (0,)))
+        if n_told == 1:
+            said = (*said, f"its array {name} is one number for {count} images: not taken")
+        elif name in shapes and not _of_another_stack(n_told, shapes, count):
+            what = f"array {name}"
+            found[what] = _checked(path, what, _read(path, name, count), count, um)
+    if not found:
+        return [], said
+    first, *others = found
+    for other in others:
+        apart_um = np.abs(np.subtract(found[first], found[other]))
+        if apart_um.max() > _SAME * np.abs(found[first]).max():
+            at = int(apart_um.argmax())
+            raise DepthsError(
+                path,
+                f"its {first} and its {other} disagree about where its images lie: image {at} is at "
+                f"{found[first][at]:g} um by the one, at {found[other][at]:g} um by the other.",
+                "Leave out, or call otherwise, the one that is wrong.",
+            )
+    return found[first], said
+
+
+def _checked(path: Path, what: str, told: Any, count: int, um: float = 1.0) -> list[float]:
+    """Return depths in micrometres; raises DepthsError where they are none of so many images."""
+    try:
+        values = np.asarray(told)
+        kind = values.dtype.kind
+        in_words = _KINDS.get(kind, f"values of type {values.dtype}")
+    except ValueError:  # rows of unequal length
+        raise _refused(path, what, "holds no array", count) from None
+    if kind not in "uif":
+        raise _refused(path, what, f"holds {in_words}", count)
+    if values.size != count or max(values.shape) != count:
+        shape = " x ".join(map(str, values.shape)) or "1"
+        raise _refused(path, what, f"has {shape} of them", count)
+    with np.errstate(over="ignore"):
+        depths_um = um * values.astype(np.float64).ravel()
+    if not (finite := np.isfinite(depths_um)).all():
+        at = int(np.argmin(finite))
+        raise _refused(path, what, f"says {values.ravel()[at]:g} for image {at}", count)
+    return [float(depth) for depth in depths_um]
+
+
+def _refused(path: Path, what: str, found: str, count: int) -> DepthsError:
+    return DepthsError(
+        path,
+        f"its {what} tells where the images lie, {count} finite numbers are expected, and it {found}.",
+        "Save it anew, or under another name where it is of something else.",
+    )
+
+
+def _read(path: Path, name: str, count: int) -> Any:
+    """Return an array of the file; raises DepthsError where it is none of numbers."""
+    try:
+        return decode(path, name, lambda _shape: None)[0]
+    except FileError as error:
+        found = f"cannot be read as such: {error.problem.rstrip('.')}"
+        raise _refused(path, f"array {name}", found, count) from None
+
+
+def _of_another_stack(n_told: int, shapes: Mapping[str, tuple[int, ...]], count: int) -> bool:
+    """Whether so many depths are those of another stack of the file."""
+    stacks = [shape for shape in shapes.values() if sum(side > 1 for side in shape) >= 3]
+    return n_told != count and any(n_told in (shape[0], shape[-1]) for shape in stacks)
+
+
+def _shapes(path: Path) -> dict[str, tuple[int, ...]]:
+    """Return the shapes of a file's arrays, of any kind, by their names; empty for files of one array."""
+    if not path.is_file():
+        return {}
+    with path.open("rb") as file:
+        beginning = file.read(_BEGINNING)
+    if is_hdf5(beginning):
+        return _of_hdf5(path)
+    if is_matlab(beginning):
+        return {name: array.shape for name, array in matlab.arrays_in(path).items()}
+    return _of_npz(path) if beginning.startswith(b"PK") else {}
+
+
+def _of_hdf5(path: Path) -> dict[str, tuple[int, ...]]:
+    import h5py  # the stack was read with it
+
+    found: dict[str, tuple[int, ...]] = {}
+
+    def note(name: str, entry: Any) -> None:
+        if isinstance(entry, h5py.Dataset):
+            found[name] = entry.shape or ()
+
+    with h5py.File(path, "r") as file:
+        file.visititems(note)
+    return found
+
+
+def _of_npz(path: Path) -> dict[str, tuple[int, ...]]:
+    found: dict[str, tuple[int, ...]] = {}
+    with zipfile.ZipFile(path) as archive:
+        for one in archive.infolist():
+            name = one.filename.removesuffix(".npy")
+            found[name] = (0,)  # objects of Python's, or damaged
+            with contextlib.suppress(FileError), archive.open(one) as member:
+                found[name] = _npy_outline(path, member, one.file_size).shape
+    return found

@@ -21,7 +21,7 @@ import tifffile
 
 from instrument.files import reading
 from instrument.files.atomic import protect, whole_file, write_text
-from instrument.files.decoding import decode, depths_beside
+from instrument.files.decoding import DepthsError, decode, depths_told, tells_depths
 from instrument.files.errors import BenchError, FileError
 from instrument.files.image_folders import images_in, in_order, order_in_words
 from instrument.files.named_arrays import is_zarr, read_zarr, zarr_facts
@@ -149,7 +149,10 @@ def read_stack(path: Path | str, *, leave_out: Path | None = None) -> ImageFile:
 
 
 def read(path: Path | str) -> ImageFile:
-    """Read what a file holds, or a folder: one image, or a stack. Errors as :func:`read_image`."""
+    """Read what a file holds, or a folder: one image, or a stack. Errors as :func:`read_image`.
+
+    Three planes of NumPy's are a picture in colour, or a stack where an array beside them tells depths.
+    """
     if not isinstance(path, str | PathLike):
         raise BenchError(
             f"A file or folder is read by its name, not {type(path).__name__}; arrays are taken as they are."
@@ -157,13 +160,19 @@ def read(path: Path | str) -> ImageFile:
     if Path(path).is_dir() and not is_zarr(Path(path)) and len(images_in(Path(path))) != 1:
         return read_stack(path)
     try:
-        return read_image(path, holes=True)
+        image = read_image(path, holes=True)
     except FileError:
         try:
             return read_stack(path)
+        except DepthsError:
+            raise
         except FileError:
             pass
         raise
+    if _PLANES_AS_COLOUR in image.notes and tells_depths(image.path):
+        stack = read_stack(path)
+        return stack if "depths_um" in stack.metadata else image
+    return image
 
 
 def write_image(path: Path | str, image: npt.NDArray[Any], metadata: Mapping[str, Any] | None = None) -> None:
@@ -338,11 +347,10 @@ def _as_stack(path: Path, array: npt.NDArray[Any], notes: tuple[str, ...]) -> Im
         raise FileError(path, f"holds an array of shape {array.shape}; a stack of images is expected.")
     pixels, converted = _standard_dtype(path, array)
     told = image_metadata(path) if path.is_file() or is_zarr(path) else {}
-    depths = told.pop("depths_um", []) or (depths_beside(path, len(pixels)) if path.is_file() else [])
-    words: tuple[str, ...] = ()
-    if len(depths) == len(pixels) > 1:
+    depths, words = depths_told(path, len(pixels), told.pop("depths_um", None))
+    if depths:
         told["depths_um"] = depths
-        words = (depths_in_words(depths),)
+        words = (*words, depths_in_words(depths))
     return ImageFile(path, pixels, (*notes, *more, *converted, *words), told)
 
 
@@ -366,6 +374,9 @@ def _array_of(path: Path) -> tuple[Path, str]:
 
 
 # Shapes and dtypes ---------------------------------------------------------------------------------
+_PLANES_AS_COLOUR = "channels-first array taken as colour"
+
+
 def _several(path: Path, count: int, further: str) -> FileError:
     remedy = f"Give one of them, or their mean. {further}".rstrip()
     return FileError(path, f"holds {count} images; a single one is expected.", remedy)
@@ -378,7 +389,7 @@ def _one_image(
     while array.ndim > 2 and array.shape[0] == 1:
         array = array[0]
     if array.ndim == 3 and array.shape[0] in (3, 4) and array.shape[-1] not in (1, 2, 3, 4) and _is_npy(path):
-        array, notes = np.moveaxis(array, 0, -1), ("channels-first array taken as colour",)
+        array, notes = np.moveaxis(array, 0, -1), (_PLANES_AS_COLOUR,)
     if array.ndim == 3 and array.shape[-1] in (1, 2, 3, 4):
         array, dropped = drop_alpha(array)
         array = array[..., 0] if array.shape[-1] == 1 else array

@@ -188,11 +188,6 @@ def test_an_array_beside_a_stack_tells_its_depths(
     assert any("10" in note and "50" in note for note in read.notes), read.notes
 
 
-def test_an_array_of_other_images_tells_no_depths(tmp_path: Path) -> None:
-    np.savez(tmp_path / "psfs.npz", psfs=np.ones((3, 20, 30), np.float32), z_um=[1.0, 2.0])
-    assert "depths_um" not in read_stack(f"{tmp_path / 'psfs.npz'}::psfs").metadata
-
-
 @pytest.mark.parametrize(
     ("beginning", "says"),
     [

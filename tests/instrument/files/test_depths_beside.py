@@ -1,0 +1,115 @@
+"""Arrays that tell where the images of a stack lie: taken, or refused by name; never silently otherwise."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+import numpy.typing as npt
+import pytest
+import scipy.io
+
+from instrument.files.errors import FileError
+from instrument.files.images import ImageFile, read, read_stack
+
+STACK = np.random.default_rng(0).integers(0, 999, (5, 20, 30)).astype(np.uint16)
+
+
+def written(folder: Path, suffix: str, **arrays: Any) -> str:
+    """Write a stack with arrays beside it; return how it is named."""
+    path = folder / f"psfs{suffix}"
+    if suffix == ".h5":
+        with h5py.File(path, "w") as file:
+            for name, array in {"psfs": STACK, **arrays}.items():
+                file[name] = array.astype("S") if array.dtype.kind == "U" else array
+    elif suffix == ".npz":
+        np.savez(path, **{"psfs": STACK, **arrays})
+    else:
+        scipy.io.savemat(path, {"psfs": np.moveaxis(STACK, 0, -1), **arrays})
+    return f"{path}::psfs"
+
+
+@pytest.mark.parametrize("suffix", [".h5", ".npz", ".mat"])
+@pytest.mark.parametrize(
+    ("name", "told", "found"),
+    [
+        ("z_um", np.array([1, 2, np.nan, 4, 5]), "it says nan for image 2"),
+        ("depths_mm", np.array([1, 2, 3, 4, np.inf]), "it says inf for image 4"),
+        ("z_mm", np.array([1e308, 2, 3, 4, 5]), r"it says 1e\+308 for image 0"),
+        ("z_um", np.array([1, 2, 3, 4, 5j]), "it .*complex|it cannot be read as such"),
+        ("z_um", np.arange(4.0), "it has (1 x )?4 of them"),
+        ("z_um", np.arange(10.0).reshape(5, 2), "it has 5 x 2 of them"),
+        ("z_um", np.array(list("abcde")), "it holds text|it cannot be read as such"),
+        ("z_um", np.array([True, False, True, False, True]), "it holds booleans|it cannot be read as such"),
+        ("z_um", np.array([1, None, 3, 4, 5], object), "it cannot be read as such: .* objects of Python's"),
+    ],
+)
+def test_depths_that_are_none_are_refused_by_the_arrays_name(
+    tmp_path: Path, suffix: str, name: str, told: npt.NDArray[Any], found: str
+) -> None:
+    if (suffix, told.dtype.kind) in ((".h5", "O"), (".mat", "O"), (".mat", "U"), (".mat", "b")):
+        return  # the format has none, or does not tell it from others
+    file = written(tmp_path, suffix, **{name: told})
+    with pytest.raises(FileError, match=f"its array {name} .* 5 finite numbers are expected, and {found}"):
+        read_stack(file)
+    with pytest.raises(FileError, match=f"its array {name} tells where the images lie"):
+        read(file)
+
+
+def test_two_arrays_that_disagree_are_refused_and_two_that_agree_are_not(tmp_path: Path) -> None:
+    depths_mm = np.array([10, 20, 30, 40, 50.1])
+    file = written(tmp_path, ".npz", z_mm=depths_mm.astype(np.float32), depths_um=1e3 * depths_mm)
+    assert read_stack(file).metadata["depths_um"] == pytest.approx((1e3 * depths_mm).tolist())
+    file = written(tmp_path, ".npz", z_mm=depths_mm, depths_um=1e3 * depths_mm[::-1])
+    with pytest.raises(
+        FileError, match=r"depths_um and its array z_mm disagree .* image 0 is at 50100 um by"
+    ):
+        read_stack(file)
+
+
+def test_what_the_side_car_tells_is_checked_in_the_same_way_and_said(tmp_path: Path) -> None:
+    def with_side_car(told: object, **arrays: Any) -> ImageFile:
+        file = written(tmp_path, ".npz", **arrays)
+        (tmp_path / "psfs.json").write_text(json.dumps({"depths_um": told}))
+        return read_stack(file)
+
+    assert with_side_car([1, 2, 3, 4, 5]).metadata["depths_um"] == [1, 2, 3, 4, 5]
+    for wrong in (
+        [1, 2],
+        ["a"] * 5,
+        [[1], [1, 2]],
+        "a",
+        {"a": 1},
+        [1, 2, None, 4, 5],
+        [1, 2, float("nan"), 4, 5],
+    ):
+        stack = with_side_car(wrong)
+        assert "depths_um" not in stack.metadata
+        assert any("metadata tells where" in note and note.endswith(": not taken") for note in stack.notes)
+    with pytest.raises(FileError, match="its depths_um of its metadata and its array z_um disagree"):
+        with_side_car([1, 2, 3, 4, 5], z_um=np.arange(5.0))
+
+
+def test_depths_of_another_stack_and_one_number_for_all_are_not_taken(tmp_path: Path) -> None:
+    other = np.ones((4, 20, 30), np.float32)
+    stack = read_stack(written(tmp_path, ".npz", other=other, z_um=np.arange(4.0)))
+    assert "depths_um" not in stack.metadata
+    stack = read_stack(written(tmp_path, ".npz", z_um=np.array(7.0)))
+    assert "depths_um" not in stack.metadata
+    assert "its array z_um is one number for 5 images: not taken" in stack.notes
+
+
+def test_three_planes_with_their_depths_beside_them_are_no_colours(tmp_path: Path) -> None:
+    three = STACK[:3]
+    np.savez(tmp_path / "a.npz", psfs=three)
+    assert read(f"{tmp_path / 'a.npz'}::psfs").is_colour
+    np.savez(tmp_path / "a.npz", psfs=three, z_um=1e4)
+    assert read(f"{tmp_path / 'a.npz'}::psfs").is_colour
+    np.savez(tmp_path / "a.npz", psfs=three, z_mm=[10.0, 20.0, 35.0])
+    assert read(f"{tmp_path / 'a.npz'}::psfs").metadata["depths_um"] == [1e4, 2e4, 3.5e4]
+    np.savez(tmp_path / "a.npz", psfs=three, z_mm=[10.0, 20.0, 35.0, 40.0])
+    with pytest.raises(FileError, match=r"its array z_mm .* 3 finite numbers are expected, and it has 4"):
+        read(f"{tmp_path / 'a.npz'}::psfs")
