@@ -128,7 +128,7 @@ def light_of(frame: Frame | None, lit: LightState = LightState.AS_IS) -> str:
     if frame is None:
         return "unknown"
     metadata = frame.metadata
-    if spoilt(metadata.saturated_fraction, lit):
+    if spoilt(metadata.saturated_fraction, frame.image.size, lit):
         return "saturated"
     brightest = int(frame.image[::_STRIDE, ::_STRIDE].max())
     return "dark" if brightest < _DARK * ((1 << metadata.significant_bits) - 1) else "good"

@@ -8,13 +8,10 @@ from typing import TYPE_CHECKING
 
 from drivers.led_array import LedPattern
 from instrument.bench.photograph import SPOILT
-from recon.base.checks import SATURATED_SHARE
+from recon.base.checks import many_saturated
 
 if TYPE_CHECKING:
     from instrument.bench.bench import Bench
-
-SPOILT_PSF = SATURATED_SHARE
-"""As ``SPOILT``, of a photograph of the point source, whose brightest pixels explain every later one."""
 
 
 class LightState(enum.StrEnum):
@@ -26,9 +23,14 @@ class LightState(enum.StrEnum):
     AS_IS = "as-is"
 
 
-def spoilt(saturated_share: float, light: LightState) -> bool:
-    """Whether so many saturated pixels spoil a photograph in this light."""
-    return saturated_share > (SPOILT_PSF if light is LightState.SOURCE else SPOILT)
+def spoilt(saturated_share: float, n_pixels: int, light: LightState) -> bool:
+    """Whether so large a share of saturated pixels spoils a photograph of so many pixels in this light.
+
+    Of the point source as a PSF is judged, whose brightest pixels explain every later photograph.
+    """
+    if light is LightState.SOURCE:
+        return many_saturated(saturated_share, n_pixels)
+    return saturated_share > SPOILT
 
 
 def switch_light(bench: Bench, light: LightState) -> None:

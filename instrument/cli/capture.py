@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -208,7 +209,7 @@ def _report(target: Path, taken: Snapshot, light: LightState) -> None:
         f"{metadata.exposure_ms:g} ms, gain {metadata.gain:g}, {frames}."
     )
     saturated = metadata.saturated_fraction
-    too_many = spoilt(saturated, light)
+    too_many = spoilt(saturated, taken.image.size, light)
     few = f"; {percent(saturated)} of the pixels are saturated" if saturated and not too_many else ""
     typer.echo(
         f"Counts {float(taken.image.min()):g} to {float(taken.image.max()):g}, "
@@ -293,7 +294,8 @@ def _last_words(run: Run, light: LightState) -> None:
     if saturated := [f for r in run.records.values() if (f := r.metadata.saturated_fraction) > 0]:
         most = percent(max(saturated))
         words = f"{len(saturated)} of {len(run.records)} frames have saturated pixels, up to {most} of them"
-        if spoilt(max(saturated), light):
+        n_pixels = math.prod(run.array.frame_shape)
+        if spoilt(max(saturated), n_pixels, light):
             typer.echo(f"Warning: {words}{_none_may(light)}; shorten --exposure-ms.", err=True)
         else:
             typer.echo(f"{words}.")

@@ -16,6 +16,8 @@ from recon.types import Calibration, plain_array, real_array
 
 SATURATED_SHARE = 1e-5
 """Share of pixels at exactly the maximum above which an image is taken for saturated."""
+_FEW = 4
+"""Fewer saturated pixels are none, of a small image, too: the sensor's own hot ones."""
 
 SATURATED_LIGHT = 0.01
 """Share of a PSF's light in saturated pixels from which the picture suffers."""
@@ -190,6 +192,11 @@ def require_calibration(given: object) -> None:
         )
 
 
+def many_saturated(share: float, n_pixels: int) -> bool:
+    """Whether such a share of an image's pixels at its maximum are enough to take it for saturated."""
+    return share > SATURATED_SHARE and round(share * n_pixels) >= _FEW
+
+
 def saturated_share(image: npt.NDArray[Any]) -> float:
     """Return the share of pixels at exactly the maximum when it is suspicious, else 0.
 
@@ -198,7 +205,7 @@ def saturated_share(image: npt.NDArray[Any]) -> float:
     top = image.max()
     at_top = int(np.count_nonzero(image == top))
     share = at_top / image.size
-    if at_top < 4 or share <= SATURATED_SHARE:
+    if not many_saturated(share, image.size):
         return 0.0
     below = image[image < top]
     return share if not below.size or at_top > np.count_nonzero(below == below.max()) else 0.0

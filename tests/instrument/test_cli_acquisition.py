@@ -6,9 +6,11 @@ import shutil
 import stat
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from drivers.simulated.camera import SimulatedCamera
+from instrument.bench.lit import LightState, spoilt
 from instrument.cli import main
 from instrument.plan import Plan
 from instrument.plan.model import load_plan, plan_toml, save_plan
@@ -16,6 +18,7 @@ from instrument.runs.inspection import verify
 from instrument.runs.run import FinishReason, Run, RunCondition
 from instrument.runs.run_files import RunError, refuse_within
 from instrument.runs.writer import RunWriter
+from recon.base.checks import saturated_share
 from tests.mocks.devices import MockCamera, MockStage
 
 pytestmark = pytest.mark.usefixtures("mock_drivers")
@@ -266,6 +269,19 @@ def test_a_pixel_at_full_scale_is_told_and_no_warning(
     told = "".join((told.err, *capsys.readouterr()))
     assert "2 of 2 frames have saturated pixels, up to less than 0.001 % of them." in told
     assert "Warning" not in told
+
+
+def test_a_few_hot_pixels_spoil_no_psf_as_its_judge_says() -> None:
+    """Of 0.1 and 0.3 megapixels a share alone would be 1 and 3 pixels."""
+    for n_pixels in (100_000, 300_000, 5_500_000):
+        image = np.linspace(0, 1, n_pixels, dtype=np.float32)
+        for n in (1, 2, 3, 4, 56):
+            image[:] = np.linspace(0, 1, n_pixels)
+            image[:n] = 2
+            judged = saturated_share(image) > 0
+            assert spoilt(n / n_pixels, n_pixels, LightState.SOURCE) is judged
+            assert judged is (n > 3 and n > 1e-5 * n_pixels)
+            assert not spoilt(n / n_pixels, n_pixels, LightState.SCENE)
 
 
 def test_a_point_source_is_warned_of_before_a_scene(
