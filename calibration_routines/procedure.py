@@ -48,7 +48,7 @@ class Outlook:
     """The plan in words where more is to be said than frames and seconds; exposures are only found at the
     start (:meth:`Listener.planned`)."""
     beside_s: float = 0.0
-    """What frames that are not kept take by the clock, of a search, where the cost has none of them."""
+    """What frames take by the clock that the cost has none of: of a search, or all without a plan."""
     work: tuple[tuple[str, float], ...] = ()
     """What steps compute, in their order: a step's name, and so many transforms of 1024 x 1024 there and
     back. All that follows the first of them is there, or nothing."""

@@ -42,10 +42,11 @@ def first_guess(bench: Bench, outlook: Outlook) -> tuple[str, ...]:
 
     Nor on a simulated bench, whose light is computed, too: that is rehearsed.
     """
-    if not outlook.work or outlook.cost is None or bench.simulated_kinds:
+    planned_s = 0.0 if outlook.cost is None else outlook.cost.waited_s
+    waiting_s = planned_s + outlook.beside_s
+    if not outlook.work or not waiting_s or bench.simulated_kinds:
         return ()
     computing_s = kept_times.computing_s(sum(transforms for _, transforms in outlook.work))
-    waiting_s = outlook.cost.waited_s + outlook.beside_s
     return (
         f"{IN_ALL}by a first guess: about {duration(waiting_s + computing_s)}, {duration(waiting_s)} of it "
         "frames at the present exposure, the rest computing.",

@@ -12,7 +12,7 @@ import numpy.typing as npt
 from calibration_routines.display.display_io import DisplayBench, bring_mask, require_slm, writable
 from calibration_routines.display.hologram_photograph import HologramCamera
 from calibration_routines.display.kept_frames import KeptFrames, SeenAgain, kept_words
-from calibration_routines.display.pattern_series import photograph_series, series_frames
+from calibration_routines.display.pattern_series import photograph_series, series_frames, visited_before
 from calibration_routines.options import Checked
 from calibration_routines.procedure import Listener, Outcome, Outlook, Procedure
 from calibration_routines.routine import Routine
@@ -25,7 +25,7 @@ from instrument.files.slm_image import load_slm_correction
 from instrument.runs.run_control import RunControl
 from recon.base.declare import option
 from recon.holography import Display
-from recon.holography.learn import Lesson, learn_display
+from recon.holography.learn import Lesson, learn_display, learning_work
 from recon.holography.pose import NODES, Pose
 
 DISPLAY_FILE = "display.json"
@@ -33,6 +33,13 @@ DISPLAY_FILE = "display.json"
 ASIDE = 3
 """Photographs that are not fitted but judge."""
 _REGISTERING = 2  # frames: a dark one, and the blank SLM's
+
+
+PHOTOGRAPHING, LEARNING = "photographing random patterns", "learning"
+"""Its steps."""
+_REGISTER, _SEE, _LIGHT, _FRAME = 42.0, 11.0, 8.0, 2.0
+"""Transforms of 1024 x 1024 a megapixel of the sensor: to register the camera, to see a frame, and on a
+simulated bench for a pattern's light and a frame of it; once, on 1.2 megapixels."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -70,6 +77,11 @@ class LearningProcedure(SeenAgain, Checked, Procedure):
         """Frames it takes."""
         return _REGISTERING + series_frames(self.patterns)
 
+    @property
+    def _shown(self) -> int:
+        """How often a pattern is shown."""
+        return self.patterns - 1 + len(visited_before(self.patterns))
+
     def outlook(self, bench: Bench, folder: Path | None = None) -> Outlook:
         """Refuse a bench without SLM or with mirrors, files that cannot be read or do not fit or exist."""
         slm = require_slm(bench, "only phases can be learned")
@@ -87,8 +99,21 @@ class LearningProcedure(SeenAgain, Checked, Procedure):
             (
                 f"{self.patterns} random patterns of {height} x {width} pixels, {self.frames} frames",
                 kept_words(bench, self.frames, self.again),
-            )
+            ),
+            beside_s=1e-3 * (self.frames * bench.camera.exposure_ms + self._shown * slm.settle_ms),
+            work=(
+                (PHOTOGRAPHING, self._photographing(bench)),
+                (LEARNING, learning_work(int(np.prod(display.mask.shape)), self.patterns - ASIDE)),
+            ),
         )
+
+    def _photographing(self, bench: Bench) -> float:
+        """Return what photographing computes, in transforms of 1024 x 1024, simulated light with it."""
+        height, width = bench.camera.frame_shape[:2]
+        transforms = _REGISTER + _SEE * series_frames(self.patterns)
+        if bench.simulated_kinds:
+            transforms += _LIGHT * self._shown + _FRAME * self.frames
+        return 1e-6 * height * width * transforms
 
     def perform(self, bench: Bench, folder: Path | None, control: RunControl, listener: Listener) -> Outcome:
         """Photograph, learn, and save what ``hologram`` and ``show`` take as an alignment."""
@@ -113,12 +138,12 @@ class LearningProcedure(SeenAgain, Checked, Procedure):
                 bring_mask(bench, place.stage_position)
             else:
                 place = _in_place(nominal, bench)
-            listener.step("photographing random patterns")
+            listener.step(PHOTOGRAPHING)
             seen = HologramCamera.registered(io, place.of(nominal))
             series = photograph_series(seen, self.patterns)
             bench.stop()
             kept.finish()
-            listener.step("learning")  # who interrupts it is told how to see the frames again
+            listener.step(LEARNING)  # who interrupts it is told how to see the frames again
             lesson = learn_display(seen.display, series.looks, aside=ASIDE, on_progress=progress)
         found = learned_alignment(place, nominal, lesson, corrected=self.slm_calibration is not None)
         doubted = bool(series.findings)

@@ -280,9 +280,9 @@ def _visit(change: Change, grown: float, lags: Complexes, first: Complexes) -> V
     (seen, shared), (_, reference) = _powers(lags), _powers(first)
     if not shared > 0 or not reference > 0:
         raise CalibrationError(_LOST)
+    n_frames, n = lags.shape
     alike = float(np.vdot(first.mean(axis=0), lags.mean(axis=0)).real)
     other = 0.0 if lags is first else max(0.0, 1 - alike * abs(alike) / (shared * reference))
-    n_frames, n = lags.shape
     in_mean = max(0.0, seen / shared - 1) / n_frames
     error = in_mean * float(np.sqrt((2 + 2 * n_frames / (n_frames - 1)) / n))
     level, level_error = float(np.sqrt(shared / reference)), float(np.sqrt(in_mean / n))

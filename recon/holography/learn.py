@@ -239,7 +239,7 @@ def learn_display(
     rounds: list[float] = []
     found = [np.zeros(len(fit.scales))]
     plan = (*CUTS, *[CUTS[-1]] * (_MIRRORED + _LAST))
-    per = min(max(AT_ONCE, -(-len(fitted) // len(CUTS))), len(fitted))  # so that each is fitted in some round
+    per = _in_a_round(len(fitted))
     for number, cut in enumerate(plan):
         if number == len(CUTS):
             found.append(fit.mirrored(found[0]))
@@ -263,6 +263,23 @@ def learn_display(
         )
     helps = after**2 < _WORTH * before**2
     return Lesson(learned if helps else display, before, after, tuple(rounds), helps)
+
+
+def _in_a_round(fitted: int) -> int:
+    """Return how many photographs a round fits, so that each of them is fitted in some round."""
+    return min(max(AT_ONCE, -(-fitted // len(CUTS))), fitted)
+
+
+def learning_work(mask_pixels: int, fitted: int) -> float:
+    """Return what learning from so many fitted photographs computes, in transforms of 1024 x 1024.
+
+    Measured once with two photographs a round behind a mask of 0.92 megapixels; one of 0.083, of which a step
+    was, takes 790 by that and 760 by this.
+    """
+    return _OF_A_PHOTOGRAPH * float((1e-6 * mask_pixels) ** 1.5) * _in_a_round(fitted)
+
+
+_OF_A_PHOTOGRAPH = 28000.0 / 2 / 0.9216**1.5
 
 
 def unexplained(display: Display, looks: Sequence[Look]) -> float:

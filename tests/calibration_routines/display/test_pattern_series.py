@@ -26,11 +26,12 @@ from calibration_routines.display.pattern_series import (
 )
 from calibration_routines.purpose import CalibrationError
 from calibration_routines.scatter import NO_CHANGE, STEADY, Scatter
+from calibration_routines.times import first_guess
 from instrument.bench.bench import Bench
 from instrument.bench.config_file import parse_config
 from recon.holography import Display, random_mask
 from recon.holography.camera_map import CameraMap
-from recon.holography.learn import Lesson
+from recon.holography.learn import Lesson, learning_work
 from tests.calibration_routines.display.test_mask_alignment import small
 
 Array = npt.NDArray[Any]
@@ -163,6 +164,22 @@ def test_one_pattern_is_visited_once_and_nothing_is_found() -> None:
     alone = series(count=1)
     assert (alone.frames, len(alone.looks)) == (series_frames(1), 1)
     assert (alone.findings, alone.notes) == ((), ())
+
+
+def test_the_time_of_photographing_and_learning_is_told_before() -> None:
+    """On a real bench a first guess; on a simulated one what learning takes is told by its size."""
+    with Bench(parse_config(small(), None)).open() as bench:
+        outlook = LearningProcedure().outlook(bench)
+        assert bench.slm is not None
+        waiting_ms = 26 * bench.camera.exposure_ms + 16 * bench.slm.settle_ms
+    assert [step for step, _ in outlook.work] == ["photographing random patterns", "learning"]
+    assert 1e3 * outlook.beside_s == pytest.approx(waiting_ms)
+    (words,) = first_guess(SimpleNamespace(simulated_kinds=()), outlook)  # type: ignore[arg-type]
+    assert words.startswith("In all, by a first guess: about ")
+    assert learning_work(720 * 1280, 2) == pytest.approx(28000)
+    assert learning_work(720 * 1280, 10) == pytest.approx(28000)  # ten are fitted two a round
+    assert learning_work(720 * 1280, 30) == pytest.approx(3 * 28000)
+    assert learning_work(216 * 384, 8) == pytest.approx(790, rel=0.1)
 
 
 def test_what_is_learned_of_a_picture_that_shook_is_doubtful_and_says_so(
