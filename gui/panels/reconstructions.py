@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from datetime import datetime
 from functools import partial
 from html import escape
@@ -47,6 +47,7 @@ from recon.reconstruction.options import ReconstructionOptions
 
 _NOTHING_OPEN = "Nothing is open: choose a result on the left, or reconstruct a photograph."
 _FORM_OPEN = "Nothing is open: fill in the form on the left, then press Reconstruct."
+_AS_IT_STANDS = "as it stands would be reconstructed like this:"
 _REFINABLE = "--refine-psf fits"
 """In the verdict's sentence, where fitting the PSF to the photograph is what helps."""
 
@@ -209,9 +210,7 @@ class ReconstructionsPanel(Panel):
         self.heading.setText(f"<b>{escape(result.path.name)}</b>")
         self.heading.setToolTip(str(result.path))
         self._say_what_is_shown()
-        warnings = [self.in_its_words(warning) for warning in result.warnings]
-        facts = [(name, self.in_its_words(value)) for name, value in result.facts()]
-        self.facts.show_facts(facts, warnings, simulated=result.simulated)
+        self._show_facts()
         self.convergence.show_histories(result.histories, result.noise_norm)
         self.export_button.setEnabled(True)
         misfit = any(_REFINABLE in warning for warning in result.warnings)
@@ -226,6 +225,18 @@ class ReconstructionsPanel(Panel):
             self.viewers.setCurrentWidget(self.picture)
             beside = {"Deviation": result.deviation, "Residual": result.residual}
             self.picture.show_picture(result.image, pitch_um=result.pitch_um, beside=beside)
+
+    def _show_facts(self, explained: Sequence[tuple[str, str]] = ()) -> None:
+        """Show what is known of the result that is shown; above it what is said of the form, if anything."""
+        result = self.result
+        if result is None:
+            self.facts.show_facts(explained)
+            return
+        warnings = [self.in_its_words(warning) for warning in result.warnings]
+        facts = [(name, self.in_its_words(value)) for name, value in result.facts()]
+        if explained:
+            facts = [("The form", _AS_IT_STANDS), *explained, ("The picture", result.path.name), *facts]
+        self.facts.show_facts(facts, warnings, simulated=result.simulated)
 
     def _say_what_is_shown(self) -> None:
         """Say over a result when its photograph was taken and in which light, and how it is turned."""
@@ -350,6 +361,8 @@ class ReconstructionsPanel(Panel):
         self._begun(job, "Looking at PSFs and photograph …", keeps=False)
         job.progressed.connect(self._explaining_so_far)
         job.succeeded.connect(self._explained)
+        for unended in (job.failed, job.cancelled):
+            unended.connect(lambda _: self._show_facts())  # Stop keeps nothing
         job.cancelled.connect(lambda _: self.form.show_progress(0.0, "Stopped."))
         job.ended.connect(lambda: setattr(self, "_explaining", None))
         return job
@@ -374,7 +387,7 @@ class ReconstructionsPanel(Panel):
             facts.append((decision.name.capitalize(), f"{decision.value}: {decision.why}"))
             steps = (("up", decision.up), ("down", decision.down))
             facts += [("", f"one step {way}: {option}") for way, option in steps if option is not None]
-        self.facts.show_facts([(name, self.in_its_words(words)) for name, words in facts])
+        self._show_facts([(name, self.in_its_words(words)) for name, words in facts])
         why = "; what was chosen, and why, is below the picture" if explained.decisions else ""
         takes = "Trying what it takes …" if explained.takes is None else f"Will take {explained.takes}"
         self.form.show_progress(0.0, f"{takes}{why}.")

@@ -408,3 +408,29 @@ def test_stop_during_explain_stops_that_and_not_what_was_done_before(
     assert panel.job is before
     assert not before.is_cancelling
     assert panel.form.note.text() == "Stopped."
+
+
+def test_explain_stands_beside_the_facts_of_the_result_and_goes_where_it_is_stopped(
+    qtbot: QtBot, panel: ReconstructionsPanel, files, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    fill(panel, PSF, files, "psf.tif")
+    run(qtbot, panel)
+    facts = panel.facts.toPlainText()
+    request, tried = type(panel.form.request()), threading.Event()
+    forecast = request.forecast
+
+    def later(self: Any, *given: Any) -> Any:
+        tried.wait(WAIT_MS / 1000)
+        return forecast(self, *given)
+
+    monkeypatch.setattr(request, "forecast", later)
+    qtbot.waitUntil(panel.form.explain.isEnabled, timeout=WAIT_MS)
+    job = panel.explain()
+    qtbot.waitUntil(lambda: panel.facts.toPlainText() != facts, timeout=WAIT_MS)
+    both = panel.facts.toPlainText()
+    assert "The form" in both
+    assert all(line in both for line in facts.splitlines()), "the picture's own remain"
+    qtbot.mouseClick(panel.form.stop, Qt.MouseButton.LeftButton)
+    tried.set()
+    qtbot.waitUntil(lambda: job.is_over, timeout=WAIT_MS)
+    assert panel.facts.toPlainText() == facts
