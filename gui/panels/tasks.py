@@ -81,7 +81,7 @@ class TasksPanel(Panel):
         self._given: dict[str, Path] = {}
         self.files: tuple[Path, ...] = ()
         self._lent_px = 0
-        """Width that the form has lent to a table."""
+        """Width that the form has lent to a table, until it is taken back or the operator moves the border."""
 
     def parts(self) -> Iterator[None]:
         """Make the widgets."""
@@ -102,6 +102,7 @@ class TasksPanel(Panel):
         results = self._make_results()
         yield
         self._across = split(left, results, sizes=[430, 800], stretch=1, firm=True)
+        self._across.splitterMoved.connect(lambda _x, _i: setattr(self, "_lent_px", 0))
         fill(self.body, self._across)
         self.choice.currentIndexChanged.connect(self._chosen)
         self.run_bar.start.connect(self.start)

@@ -329,3 +329,18 @@ def test_the_field_of_view_is_told_in_a_table_that_fits_a_small_screen(
     assert panel.stack.width() < form_px
     shown(qtbot, panel, "spots")
     assert panel.stack.width() == form_px, "it was lent until something else is shown"
+
+
+def test_a_border_that_was_moved_stays_where_it_was_put(qtbot: QtBot, panel: TasksPanel) -> None:
+    panel.resize(SIZES["1366x768"].width() - 480, 600)
+    panel.show()
+    shown(qtbot, panel, "etendue")
+    with qtbot.waitSignal(panel.run.over, timeout=WAIT_MS):
+        panel.start()
+    form_px = panel.stack.width()
+    qtbot.waitUntil(lambda: panel.stack.width() < form_px, timeout=WAIT_MS)
+    across = panel._across
+    across.moveSplitter(across.sizes()[0] + 20, 1)  # as the mouse does
+    put = across.sizes()
+    shown(qtbot, panel, "spots")
+    assert across.sizes() == put
