@@ -214,7 +214,10 @@ class ProcedurePanel(Panel):
         first = routine.start if routine.name not in self._started else None
         procedure = self.procedure() if first is None else None
         if procedure is None and first is None:
-            self.run_bar.set_startable("The form has mistakes.")
+            if self.view.is_untouched:
+                self._ask_for_what_is_missing()
+            else:
+                self.run_bar.set_startable("The form has mistakes.")
             return
         self.run_bar.set_startable("It is being checked.")
 
@@ -240,6 +243,13 @@ class ProcedurePanel(Panel):
         self._check_job.failed.connect(self._check_failed)
         self._check_job.cancelled.connect(lambda _: self._check_stopped())
         self._check_job.ended.connect(self._check_ended)
+
+    def _ask_for_what_is_missing(self) -> None:
+        """Say of a form that nothing was typed into what it needs: no field is wrong yet."""
+        reasons = filter(None, map(self.view.reason, self.view.fields))
+        self._say("\n".join(reasons) or self.verdict.toPlainText(), wrong=False)
+        self.view.clear_reasons()
+        self.run_bar.set_startable("Something is to be given first; see below the form.")
 
     def show_problem(self, error: BenchError) -> None:
         """Show a mistake: at the fields that it names, and below the form."""

@@ -119,8 +119,13 @@ class OptionsForm(QWidget):
             field.edited.connect(self._edited)
             field.refused.connect(partial(self._refused_itself, name))
             field.settled.connect(partial(self.settled.emit, name))
-        self._state = self._raw()
+        self._begun = self._state = self._raw()
         self._update_enabled()
+
+    @property
+    def is_untouched(self) -> bool:
+        """Whether it stands as it began: what is missing in it is no mistake yet."""
+        return self._state == self._begun
 
     def wholes(self) -> list[QWidget]:
         """Return what takes a theme for itself, once it is made: what is seen first, and what is folded."""
@@ -190,7 +195,10 @@ class OptionsForm(QWidget):
             for name, widget in self.widgets.items()
             if isinstance(widget, QLineEdit) and not widget.text() and not widget.placeholderText()
         }
+        untouched = self.is_untouched
         self.set_values({name: value for name, value in values.items() if name in empty})
+        if untouched:
+            self._begun = self._state
 
     def in_its_words(self, text: str) -> str:
         """Return a message with labels where the terminal's has flags, another form's as words."""

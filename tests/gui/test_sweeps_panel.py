@@ -500,3 +500,18 @@ def test_frames_of_patterned_light_lead_to_their_picture_in_files(
     qtbot.waitUntil(lambda: "patterned" in tasks._pages and not tasks._given, timeout=WAIT_MS)
     (run,) = window.session.runs_folder.glob("*active-illumination")
     assert tasks._pages["patterned"].form.value("run") == run
+
+
+def test_a_form_that_nothing_was_typed_into_asks_for_what_it_needs_and_is_not_red(
+    qtbot: QtBot, panel: SweepsPanel
+) -> None:
+    panel.choice.setCurrentIndex(list(panel.routines).index(ILLUMINATION))
+    qtbot.waitUntil(lambda: "Lattice" in panel.verdict.toPlainText(), timeout=WAIT_MS)
+    assert not panel.verdict.property("refused")
+    assert not any(map(panel.view.reason, panel.view.fields))
+    assert not panel.run_bar.start_button.isEnabled()
+    panel.view.set_values({"lattice": 2, "pattern": "half"})
+    qtbot.waitUntil(lambda: bool(panel.view.reason("groups")), timeout=WAIT_MS)
+    assert panel.verdict.property("refused")
+    panel.view.set_values({"lattice": None, "pattern": None})
+    qtbot.waitUntil(lambda: not panel.verdict.property("refused"), timeout=WAIT_MS)
