@@ -46,6 +46,8 @@ _BUDGET_MS = 80.0
 """A picture's time: twelve a second leave half of a two-core machine to the camera and the window."""
 _PATIENCE_S = 1.5
 """Without a frame for longer than this and three exposures, the picture is called old."""
+_TELL_S = 0.5
+"""Figures below the picture are written this often, at most: each time the panel is laid out and painted."""
 _NO_CALIBRATION = "Choose a calibration; the Sweeps panel makes one."
 _ALL_DEPTHS = "all depths"
 _WHITE = 99.8
@@ -71,6 +73,10 @@ class _SoFar:
     image: npt.NDArray[np.float32]
 
 
+def _lines(words: tuple[str, str]) -> str:
+    return "\n".join(filter(None, words))
+
+
 class LiveReconstructionPanel(Panel):
     """Reconstructs the live view's newest frame again and again; never slows the camera.
 
@@ -87,6 +93,9 @@ class LiveReconstructionPanel(Panel):
         self._refining: Job | None = None
         self._holds = False
         self._shown: LiveResult | None = None
+        self._telling = self._told = ("", "")
+        """How quickly the picture shown came, and what it is worth; what of that is written."""
+        self._told_s = 0.0
         self._seeker = DepthSeeker(session, self._use_depth)
         self._logged: tuple[str, ...] = ()
         """Warnings of the reconstructor in use that are in the log already."""
@@ -335,6 +344,8 @@ class LiveReconstructionPanel(Panel):
         if result is None or result is self._shown:
             if silent:
                 self._call_old(silent)
+            if self.status.text() == _lines(self._told):  # nothing else was said since
+                self._tell(self._telling)
             return
         self._shown = result
         self._show_picture(result.picture.image)
@@ -354,8 +365,17 @@ class LiveReconstructionPanel(Panel):
         late = (
             f"{result.latency_ms:.0f} ms" if result.latency_ms < 1000 else f"{result.latency_ms / 1e3:.2f} s"
         )
-        latency = f"latency {late}{rate}{passed}"
-        self.status.setText("\n".join(filter(None, (latency, worth))))
+        self._tell((f"latency {late}{rate}{passed}", worth))
+
+    def _tell(self, words: tuple[str, str]) -> None:
+        """Write below the picture what is told of it; where only figures are new, not at once."""
+        self._telling, now_s = words, time.monotonic()
+        written = self.status.text() == _lines(self._told)
+        soon = words[1] == self._told[1] and now_s < self._told_s + _TELL_S
+        if written and (soon or words == self._told):
+            return
+        self._told, self._told_s = words, now_s
+        self.status.setText(_lines(words))
 
     def _silence(self) -> str:
         """Say for how long no frame has come, where one should have; of the picture's own with no stream."""

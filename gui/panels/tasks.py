@@ -81,7 +81,7 @@ class TasksPanel(Panel):
         self._given: dict[str, Path] = {}
         self.files: tuple[Path, ...] = ()
         self._lent_px = 0
-        """Width that the form has lent to a table, until it is taken back or the operator moves the border."""
+        """Width that the form has lent to a table, until it is taken back or the border is moved."""
 
     def parts(self) -> Iterator[None]:
         """Make the widgets."""

@@ -34,6 +34,14 @@ def usual_levels(image: Image) -> tuple[float, float]:
     return float(low), float(max(high, low + 1) if counts or high <= low else high)
 
 
+def _alike(one: Image, other: Image) -> bool:
+    """Return whether two pictures are the same; a row of most that are not tells it."""
+    if one.shape != other.shape:
+        return False
+    middle = len(one) // 2
+    return np.array_equal(one[middle], other[middle]) and np.array_equal(one, other)
+
+
 class _TurnedGraphics(pg.GraphicsView):  # type: ignore[misc]
     """Graphics that are turned and mirrored as a whole: what lies over a picture goes with it."""
 
@@ -115,6 +123,8 @@ class ImageView(QWidget):
         self._mouse: QPointF | None = None
         """The last place of the mouse in the scene."""
         self._indices: npt.NDArray[np.uint8] = np.empty((0, 0), np.uint8)
+        self._before: npt.NDArray[np.uint8] = np.empty((0, 0), np.uint8)
+        """What the screen shows while the next is made."""
         self.extent = (1, 1)
         """Width and height of what is shown."""
         self._levels: tuple[float, float, int | None, tuple[int, int] | None] = (0.0, 1.0, None, None)
@@ -198,15 +208,19 @@ class ImageView(QWidget):
         size = (image.shape[0] // step, image.shape[1] // step)
         mapped = image.ndim == 2 or spares_hues(self._colour_map)
         shape = size if mapped else (*size, *image.shape[2:])
+        self._indices, self._before = self._before, self._indices
         if self._indices.shape != shape:
             self._indices = np.empty(shape, np.uint8)
         self._fill(image, low, high, full_scale, step)
+        place = extent or (size[1] * step, size[0] * step)
+        placed = (*place, *size, mapped and self._colour_map)
+        if placed == self._placed and _alike(self._indices, self._before):
+            return  # a dark picture after another: nothing to paint
         lut = table(self._colour_map) if mapped else None
         self.item.setImage(self._indices, autoLevels=False, levels=None, lut=lut)
-        place = extent or (size[1] * step, size[0] * step)
-        if (*place, *size) != self._placed:
-            self._placed = (*place, *size)
+        if placed[:-1] != self._placed[:-1]:
             self.item.setRect(QRectF(0, 0, *place))
+        self._placed = placed
 
     def whole(self) -> None:
         """Show the whole image."""
@@ -256,7 +270,7 @@ class ImageView(QWidget):
 
     def clear(self) -> None:
         """Show nothing."""
-        self.image = None
+        self.image, self._placed = None, ()
         self.item.clear()
         self.set_caption("")
         self.caution_against("")

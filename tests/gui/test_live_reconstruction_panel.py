@@ -117,6 +117,28 @@ def test_a_picture_of_noise_is_called_so_by_its_own_frame_and_an_old_one_old(
     assert panel.view.caution == "Old picture: the preview is off"
 
 
+def test_in_the_dark_nothing_is_painted_that_did_not_change(
+    qtbot: QtBot, window: MainWindow, panel: LiveReconstructionPanel, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    window.session.bench.scene_off()
+    qtbot.waitUntil(lambda: panel.view.caution.startswith("Dark"), timeout=WAIT_MS)
+    qtbot.waitUntil(lambda: panel.status.text().endswith("passed over"), timeout=WAIT_MS)
+    monkeypatch.setattr(live_reconstruction, "_TELL_S", WAIT_MS)
+    painted: list[object] = []
+    show, tell, see = panel.view.item.setImage, panel.status.setText, panel._show_picture
+    seen: list[object] = []
+    monkeypatch.setattr(panel, "_show_picture", lambda image: (seen.append(image), see(image)))
+    monkeypatch.setattr(panel.view.item, "setImage", lambda *a, **k: (painted.append(a), show(*a, **k)))
+    monkeypatch.setattr(panel.status, "setText", lambda words: (painted.append(words), tell(words)))
+    qtbot.waitUntil(lambda: len(seen) > 3, timeout=WAIT_MS)
+    assert not painted
+    monkeypatch.setattr(live_reconstruction, "_TELL_S", 0.0)
+    qtbot.waitUntil(lambda: bool(painted), timeout=WAIT_MS)
+    window.session.bench.scene_on()
+    qtbot.waitUntil(lambda: not panel.view.caution and len(painted) > 4, timeout=WAIT_MS)
+    assert panel.view.item.image.any(), "what is lit is painted"
+
+
 def test_frames_that_do_not_fit_the_calibration_are_told(
     qtbot: QtBot, window: MainWindow, panel: LiveReconstructionPanel
 ) -> None:
