@@ -67,6 +67,7 @@ REFUSED: list[tuple[Callable[[], object], type[Exception], str]] = [
     (lambda: Convolution(np.repeat(PSF, 2, 0), (8, 9), n_channels=3), InputError, "PSFs of 2 channels"),
     (lambda: Convolution(PSF, (8, 9), grid_shape=(11, 15)), InputError, "does not hold the field"),
     (lambda: Convolution(PSF, (8, 9), grid_shape=(12, 14)), InputError, "does not hold the field"),
+    (lambda: Erasures(np.ones((8, 8), bool), (1, 8, 9)), InputError, "of True and False, not (8, 8)"),
     (lambda: as_cropped_convolution(CAMERA.H), StructureError, "needs a Convolution of a picture"),
     (lambda: as_cropped_convolution(Convolution(PSF[None], (8, 9))), StructureError, "of a picture"),
     (lambda: split_bayer(np.ones((4, 4)), "RGBG"), InputError, "'RGBG' is not known"),  # type: ignore[arg-type]

@@ -146,7 +146,11 @@ def test_the_bound_of_a_single_pixel_psf_is_not_below_its_norm():
 @pytest.mark.parametrize("which", ["mask", "weight", "psf", "second psf"])
 def test_one_negative_weight_or_psf_has_the_norm_estimated(which):
     """Sums of rows and columns bound the norm only of what is nowhere negative."""
-    laid = [strip(0, (slice(0, 15), slice(0, 61)), [part(slice(0, 9), (0, 1)), part(slice(7, 15), (1,))])]
+    window = slice(0, 15), slice(0, 61)
+    laid = [
+        strip(0, window, [part(slice(0, 9), (0, 1)), part(slice(7, 15), (1,))]),
+        strip(0, window, [part(slice(0, 9), (0, 1))]),
+    ]
     for numbers in (laid[0].masks, *(a for p in laid[0].parts for a in (p.weights, p.psfs))):
         numbers[(-1,) * numbers.ndim] = 0
     plain = SpatiallyVarying(laid, FIELD, SENSOR, n_channels=2, dtype=np.float64)

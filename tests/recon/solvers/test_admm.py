@@ -46,6 +46,16 @@ def masked(operator, data):
     return data * operator.outer.valid if hasattr(operator, "outer") else data
 
 
+def test_what_stands_at_erased_pixels_does_not_count():
+    operator, data = problem(erased=True)
+    prior, rules = PRIORS["tv"], StoppingRules(iterations=20, tolerance=0)
+    left_out = ~np.broadcast_to(operator.outer.valid, data.shape)
+    expected = Admm(operator, np.where(left_out, 0, data), prior).run(rules).solution
+    for number in (np.nan, np.inf, 1e6):
+        found = Admm(operator, np.where(left_out, number, data), prior).run(rules).solution
+        np.testing.assert_array_equal(found, expected)
+
+
 @pytest.mark.parametrize(("n_channels", "erased"), [(1, False), (2, True)])
 @pytest.mark.parametrize("name", PRIORS)
 def test_reaches_the_same_minimum_as_fista(name, n_channels, erased):
