@@ -170,6 +170,32 @@ def test_light_that_falls_off_is_given_to_arrays_and_files(
     assert {"vignetting", "background", "patterns"} <= set(inspect.signature(db.reconstruct).parameters)
 
 
+def test_a_flat_field_in_counts_is_one_whatever_kind_its_numbers_are(
+    scene: tuple[np.ndarray, np.ndarray], tmp_path: Path
+) -> None:
+    photo, psf = plain(scene)
+    shade = np.linspace(0.4, 1.0, photo.size).reshape(photo.shape).astype(np.float32)
+    counts = np.round(1000 * photo * shade / photo.max()).astype(np.uint16) + 30
+    write_image(tmp_path / "photo.tif", counts)
+    write_image(tmp_path / "psf.tif", np.round(60_000 * psf / psf.max()).astype(np.uint16))
+    files = tmp_path / "photo.tif", tmp_path / "psf.tif"
+    options = {"iterations": 3, "judged": False, "model": "convolution", "erasures": "none", "binning": 1}
+    expected = db.reconstruct(*files, vignetting=shade, dark=30.0, **options).image
+    flat = np.round(20_000 * shade) + 30
+    flat[7, 9] = 60_000  # a hot pixel
+    for kind in (np.uint16, np.int32, np.float32, np.float64):
+        found = db.reconstruct(*files, vignetting=flat.astype(kind), dark=30.0, **options)
+        np.testing.assert_allclose(found.image.sum(), expected.sum(), rtol=0.01)
+        assert db.metrics.psnr(found.image / expected.max(), expected / expected.max()) > 40, kind
+        assert "counts less the dark level given and divided by 1.99" in found.job.notes["Light"]
+    found = db.reconstruct(*files, vignetting=flat.astype(np.float32), **options)
+    assert "its dark level not taken off (dark= gives it)" in found.job.notes["Light"]
+    with pytest.raises(BenchError, match=r"flat field in counts, and .* is a lit, even field"):
+        db.reconstruct(*files, vignetting=np.full(photo.shape, 20, np.uint16), dark=30.0, **options)
+    with pytest.raises(InputError, match=r"about 1 at most; found .* as of a flat field in counts"):
+        db.reconstruct(photo, psf, vignetting=flat)
+
+
 def test_options_are_completed_and_nothing_is_ignored(scene: tuple[np.ndarray, np.ndarray]) -> None:
     named = inspect.signature(db.reconstruct).parameters
     assert {o.name for o in options_of(ReconstructionOptions)} | {"dark", "crop"} <= set(named)

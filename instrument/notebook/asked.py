@@ -23,7 +23,7 @@ from recon.base.checks import as_channels
 from recon.base.declare import options_of, require, require_known, with_overrides
 from recon.errors import InputError
 from recon.reconstruction import reconstruct as one_door
-from recon.reconstruction.measurement import Measurement
+from recon.reconstruction.measurement import MOST_LIGHT, Measurement
 from recon.reconstruction.options import ReconstructionOptions
 from recon.types import Calibration, plain_array
 
@@ -31,6 +31,8 @@ Image = Path | str | ImageFile | Measurement | npt.ArrayLike
 Psf = Path | str | ImageFile | Calibration | npt.ArrayLike
 
 _INPUTS = {f.name for f in fields(InputOptions)}
+_BRIGHT = 99.9
+"""Percentile of a flat field that is taken for full light."""
 _FILES_ONLY = _INPUTS - set(one_door.FACTS)
 FACTS = tuple(name for name in one_door.FACTS if name not in _INPUTS)
 """What is known of a photograph by arrays, in Python only."""
@@ -77,7 +79,7 @@ class Asked:
             job = _job(_opened(image, "photograph"), psf, inputs, options)
             measurement = job.as_measurement(inputs.noise)
             if shade is not None:
-                job, measurement = _divided(job, measurement, _opened(shade, "vignetting"))
+                job, measurement = _divided(job, measurement, _opened(shade, "vignetting"), inputs.dark)
             return cls(measurement, job.calibration, options, job)
         if about := sorted(_FILES_ONLY & set(overrides)):
             raise BenchError(
@@ -96,19 +98,35 @@ class Asked:
         return self.prepared or _job_of_arrays(self.measurement, self.calibration)
 
 
-def _divided(job: Job, measurement: Measurement, shade: ImageFile) -> tuple[Job, Measurement]:
-    """Return a photograph with its relative light, given on the file's pixels, cut and binned as it was."""
+def _divided(job: Job, measurement: Measurement, shade: ImageFile, dark: object) -> tuple[Job, Measurement]:
+    """Return a photograph with its relative light, given on the file's pixels, cut and binned as it was.
+
+    What is beyond relative light (:data:`~recon.reconstruction.measurement.MOST_LIGHT`) is a flat field in
+    counts, of whatever kind its numbers are: it loses the dark level or frame that was given, and is divided
+    by its brightest pixels but for the last thousandth, which hot ones are among.
+    """
     assert job.reduction is not None  # of files
     light = replace(job.reduction, dark=0.0).apply(shade.pixels)
-    if shade.pixels.dtype.kind == "u" and light.max() > 0:  # a flat field in counts
-        light = light / light.max()
+    said = ""
+    if shade.pixels.dtype.kind == "u" or np.nanpercentile(light, _BRIGHT) > MOST_LIGHT:
+        known = dark != "auto"
+        light = job.reduction.apply(shade.pixels) if known else light
+        full = float(np.nanpercentile(light, _BRIGHT))
+        if full <= 0:
+            raise BenchError(
+                f"The vignetting is a flat field in counts, and at most {100 - _BRIGHT:.1f} % of it lies "
+                "above the dark level that was given: expected is a lit, even field."
+            )
+        light = light / full
+        less = "less the dark level given" if known else "its dark level not taken off (dark= gives it)"
+        said = f", counts {less} and divided by {full:.4g}"
     if light.shape[:2] != job.measurement.shape[:2]:
         raise BenchError(
             f"The vignetting is {shade.describe()}, and comes to {light.shape[0]} x {light.shape[1]} pixels "
             f"where the photograph comes to {job.measurement.shape[0]} x {job.measurement.shape[1]}: give it "
             "on the photograph's own pixels."
         )
-    said = f"divided by the vignetting that was given, {light.min():.3g} to {light.max():.3g}"
+    said = f"divided by the vignetting that was given, {light.min():.3g} to {light.max():.3g}{said}"
     told = {"vignetting": source_record(shade)}
     made = replace(job, notes={**job.notes, "Light": said}, provenance={**job.provenance, **told})
     return made, replace(measurement, vignetting=light)

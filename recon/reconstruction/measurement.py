@@ -33,6 +33,8 @@ Noise = NoiseModel | float | None
 LEAST_NOISE = 1e-5
 """Noise assumed at least, relative to the measurement's root mean square: float32 holds no more."""
 
+MOST_LIGHT = 1.5
+"""Of relative light: what lies beyond is counts. A mean of 1 instead of a maximum leaves 1.5 seldom."""
 
 MARKED = "Put numbers there, and mark them in erasures."
 """What helps where pixels of a measurement that are NaN are not erased by themselves."""
@@ -56,8 +58,9 @@ class Measurement:
         Relative light on the pixels of the picture in each frame, not negative: a reconstruction of a plain
         sheet lit by it (see :mod:`recon.camera.factors`). One pattern of ones is the ordinary photograph.
     vignetting : array, (height, width) or as ``image``, optional
-        Relative light on the pixels, which the PSF does not have: the image less its background is divided by
-        it. None: looked for where light is missing (:mod:`recon.reconstruction.background`).
+        Relative light on the pixels, about 1 at most, which the PSF does not have: the image less its
+        background is divided by it. None: looked for where light is missing
+        (:mod:`recon.reconstruction.background`).
     lines : array, (height, width) or as ``image``, optional
         Offsets that whole rows and columns share, counts: subtracted as the background is. None: looked for
         (:mod:`recon.base.shared_lines`).
@@ -158,6 +161,12 @@ class Measurement:
             shade = self.like(self.vignetting, counts, "vignetting")
             if not shade.min() > 0:
                 raise InputError(f"The vignetting is relative light, above 0; found {shade.min():g}.")
+            if (full := np.percentile(shade, 99)) > MOST_LIGHT:
+                raise InputError(
+                    f"The vignetting is relative light, about 1 at most; found {full:g}, as of a flat field "
+                    "in counts. Take its dark frame off it, and divide it by its brightest part: "
+                    "flat / numpy.percentile(flat, 99.9)."
+                )
             counts = counts / shade
         return counts
 
