@@ -40,13 +40,17 @@ _FILM = (
     "is a compressed film: its frames are no measurement any more. Take a recording, or images that are not "
     "compressed."
 )
+_AVI = (
+    "is an AVI film, which is not read, compressed or not. Of frames that are not compressed make a TIFF "
+    "stack (in Fiji: open it, save it as Tiff); compressed ones are no measurement any more."
+)
 _OTHERS: tuple[tuple[int, bytes, str], ...] = (
     (8, b"WEBP", f"is a WebP picture, {_LOSSY}."),
     (4, b"ftypheic", f"is a HEIC picture, {_LOSSY}."),
     (4, b"ftypmif1", f"is a HEIC picture, {_LOSSY}."),
     (4, b"ftypavif", f"is an AVIF picture, {_LOSSY}."),
     (4, b"ftyp", _FILM),
-    (8, b"AVI ", _FILM),
+    (8, b"AVI ", _AVI),
     (0, b"\x1aE\xdf\xa3", _FILM),
     (0, b"GIF8", f"is a GIF picture of 256 colours, {_LOSSY}."),
     (0, b"v/1\x01", "is an OpenEXR picture, which is not read. Save it as 32-bit TIFF."),

@@ -135,6 +135,7 @@ def test_numbers_that_are_no_sizes_are_not_known() -> None:
         assert np.isnan(grid_of({**facts, "pitch_um": wrong}, (2, 3, 4)).z_um).all()
     assert grid_of({**facts, "centre": [1e300, 0]}, (2, 3, 4)).centre == (1, 2)
     assert parse_json("9" * 300)
+    assert parse_json('["' + "9" * 301 + '", -1]') == ["9" * 301, -1]
     for text in ("9" * 301, b"[1" + b"0" * 301 + b"]"):
         with pytest.raises(ValueError, match="more than 300 digits"):
             parse_json(text)

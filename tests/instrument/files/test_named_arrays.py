@@ -193,8 +193,8 @@ def test_an_array_beside_a_stack_tells_its_depths(
     [
         (b"RIFF\x10\0\0\0WEBPVP8 ", "is a WebP picture, .* save it as PNG"),
         (b"\0\0\0\x18ftypheic", "is a HEIC picture"),
+        (b"RIFF\x10\0\0\0AVI LIST", "is an AVI film, which is not read, compressed or not"),
         (b"\0\0\0\x18ftypisom", "is a compressed film"),
-        (b"RIFF\x10\0\0\0AVI LIST", "is a compressed film"),
         (b"ZISRAWFILE", "is a Zeiss CZI file, .* Export it as OME-TIFF"),
         (b"SIMPLE  =                    T", "is a FITS file. Make an array"),
     ],
