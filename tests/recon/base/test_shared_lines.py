@@ -8,8 +8,9 @@ import pytest
 from scipy.signal import fftconvolve
 
 from recon import reconstruct
+from recon.base import shared_lines as module
 from recon.base.blocks import block_mean
-from recon.base.shared_lines import shared_lines
+from recon.base.shared_lines import SharedLines, shared_lines
 from recon.evaluation.measured_sets import data_folder, measured_pairs, measured_set
 from recon.reconstruction.measurement import Measurement
 from recon.reconstruction.options import ReconstructionOptions
@@ -22,6 +23,9 @@ NOISE = 10.0
 
 hand_is_here = pytest.mark.skipif(
     not (data_folder() / "diffusercam_hand").is_dir(), reason=f"the measured hand is not in {data_folder()}"
+)
+usaf_is_here = pytest.mark.skipif(
+    not (data_folder() / "diffusercam_usaf3d").is_dir(), reason=f"the USAF target is not in {data_folder()}"
 )
 pairs_are_here = pytest.mark.skipif(
     not (data_folder() / "diffusercam_pairs").is_dir(),
@@ -51,6 +55,22 @@ def of_lines(deviation: float, axis: int, seed: int = 3) -> Image:
     shape = (SHAPE[0], 1) if axis == 1 else (1, SHAPE[1])
     offsets = np.random.default_rng(seed).normal(0, deviation, shape)
     return np.asarray(np.broadcast_to(offsets, SHAPE), np.float32)
+
+
+def through(scene: npt.NDArray[np.float64], psf: Image, seed: int = 2) -> Image:
+    """Return a scene through a PSF, of 2000 electrons a pixel, with their noise."""
+    light = np.maximum(fftconvolve(scene, psf, mode="same"), 0)
+    light *= 2000 / light.mean()
+    return np.asarray(
+        light + np.sqrt(light) * np.random.default_rng(seed).standard_normal(light.shape), np.float32
+    )
+
+
+def found_in(photograph: npt.NDArray[np.float32], psf: npt.NDArray[np.float32]) -> SharedLines | None:
+    """Return what is found in a photograph with the noise that is estimated of it."""
+    problem = Problem.of(photograph, psf)
+    counts = problem.measurement.counts()
+    return shared_lines(counts.data[0], counts.valid[0], float(problem.noise[0]), problem.depths.central)
 
 
 @pytest.mark.parametrize("axis", [0, 1])
@@ -93,6 +113,71 @@ def test_stripes_that_an_object_may_cast_are_left() -> None:
     bars = 1000 * np.broadcast_to(np.random.default_rng(5).random((SHAPE[0], 1)) > 0.5, SHAPE)
     noisy = bars + NOISE * np.random.default_rng(2).standard_normal(SHAPE)
     assert shared_lines(noisy, np.ones(SHAPE, bool), NOISE, sharp) is None
+
+
+def test_one_bright_row_is_light_where_the_psf_is_a_point() -> None:
+    """One line of n deviates by sqrt(n - 1) times their mean: no bound by the mean is above that."""
+    sharp = np.zeros(SHAPE, np.float32)
+    sharp[SHAPE[0] // 2, SHAPE[1] // 2] = 1
+    for scene in (np.eye(*SHAPE)[:, [40]] * np.ones(SHAPE), np.eye(*SHAPE)[[40]] * np.ones(SHAPE)):
+        assert shared_lines(through(scene + 0.1, sharp), np.ones(SHAPE, bool), 45.0, sharp) is None
+
+
+@usaf_is_here
+@pytest.mark.parametrize("binning", [1, 2, 3, 4, 6, 10])
+def test_a_measured_psf_is_no_noise_of_lines_as_a_photograph(binning: int) -> None:
+    """Of a point, which it is: through itself, and through the PSF of the depth beside it."""
+    psfs, _ = measured_set("usaf")
+    for k in range(0, 44, 3):
+        psf, beside = (block_mean(psfs[z], binning) for z in (k, k + 1))
+        assert found_in(psf, psf) is None, k
+        assert found_in(psf, beside) is None, k
+
+
+@usaf_is_here
+@pytest.mark.parametrize("depth", [0, 22, 43])
+def test_slits_and_lines_of_a_spectrum_are_light(depth: int) -> None:
+    psf = np.maximum(block_mean(measured_set("usaf")[0][depth], 2), 0)
+    height, width = psf.shape
+    slit, cross, spectrum = (np.zeros(psf.shape) for _ in range(3))
+    slit[height // 2] = cross[height // 2] = cross[:, width // 2] = 1
+    at = [width // 4, width // 4 + 9, width // 2, width // 2 + 3, 3 * width // 4]
+    spectrum[height // 5 : 4 * height // 5, at] = [1, 0.4, 0.7, 0.2, 0.9]
+    for scene in (slit, cross, spectrum):
+        assert found_in(through(scene, psf), psf) is None
+
+
+@pytest.mark.parametrize(("deviation", "is_told"), [(7, False), (14, True)])
+def test_lines_that_differ_by_less_than_a_pixels_noise_are_left(deviation: float, *, is_told: bool) -> None:
+    even = 2000 + NOISE * np.random.default_rng(2).standard_normal(SHAPE)
+    found = shared_lines(even + of_lines(deviation, 1), np.ones(SHAPE, bool), NOISE, broad_psf())
+    assert (found is not None) == is_told
+
+
+def test_offsets_of_next_to_nothing_are_none(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Where cross-validation follows the lines nearly all the way nothing is worth a warning."""
+    monkeypatch.setattr(module, "_smooth", lambda line: 0.92 * line + 0.08 * line.mean())
+    psf = broad_psf()
+    even = 2000 + NOISE * np.random.default_rng(2).standard_normal(SHAPE)
+    assert shared_lines(even + of_lines(50, 1), np.ones(SHAPE, bool), NOISE, psf) is None
+    assert shared_lines(even + of_lines(100, 1), np.ones(SHAPE, bool), NOISE, psf) is not None
+
+
+def test_offsets_that_neighbouring_rows_share_may_be_light() -> None:
+    """As of a PSF that is not this one."""
+    psf, own = broad_psf(), of_lines(50, 1)
+    shared = own + 0.4 * np.roll(own, 1, axis=0)
+    assert shared_lines(photograph(psf) + shared, np.ones(SHAPE, bool), NOISE, psf) is None
+
+
+def test_what_rounding_leaves_of_an_estimated_noise_is_a_pixels() -> None:
+    """A JPEG's noise is next to none, its lines differ by less than the step of its counts."""
+    psf = broad_psf()
+    noise = 0.3 * np.random.default_rng(2).standard_normal(SHAPE)
+    rounded = np.round(200 + of_lines(0.2, 1) + noise)
+    assert shared_lines(rounded, np.ones(SHAPE, bool), 0.05, psf) is None
+    assert shared_lines(rounded / 64, np.ones(SHAPE, bool), 0.05 / 64, psf) is None
+    assert shared_lines(rounded + of_lines(1, 1).round(), np.ones(SHAPE, bool), 0.05, psf) is not None
 
 
 def test_rows_in_turn_of_two_colours_are_no_noise() -> None:
