@@ -167,6 +167,9 @@ def test_light_that_falls_off_is_given_to_arrays_and_files(
         db.reconstruct(*files, vignetting=shade[:20], **options)
     with pytest.raises(BenchError, match="background: for arrays"):
         db.reconstruct(*files, background=1.0)
+    with pytest.raises(BenchError, match=r"lines: for arrays .* go into a dark frame: dark=\.$"):
+        db.reconstruct(*files, lines=1.0)
+    assert "``lines``" in str(db.reconstruct.__doc__)
     assert {"vignetting", "background", "patterns"} <= set(inspect.signature(db.reconstruct).parameters)
 
 

@@ -37,6 +37,14 @@ _FILES_ONLY = _INPUTS - set(one_door.FACTS)
 FACTS = tuple(name for name in one_door.FACTS if name not in _INPUTS)
 """What is known of a photograph by arrays, in Python only."""
 
+_OF_FILES = {
+    "background": "Of a file the background is taken off by dark=.",
+    "patterns": "Patterned light of files is a run's: diffuserbench reconstruct RUN --patterned.",
+    "lines": "What rows and columns share in a file is looked for and taken off without it; known offsets "
+    "go into a dark frame: dark=.",
+}
+"""What to do instead where a photograph is a file, by the name of what arrays take."""
+
 
 @dataclass(frozen=True)
 class Asked:
@@ -68,10 +76,9 @@ class Asked:
             )
         if _is_file(image) or _is_file(psf):
             if about := [name for name in FACTS if name in overrides and name != "vignetting"]:
+                of_files = " ".join(_OF_FILES[name] for name in about)
                 raise BenchError(
-                    f"{' and '.join(about)}: for arrays (db.read(FILE).pixels is one). Of a file the "
-                    "background is taken off by dark=, and patterned light is a run's: diffuserbench "
-                    "reconstruct RUN --patterned."
+                    f"{' and '.join(about)}: for arrays (db.read(FILE).pixels is one). {of_files}"
                 )
             shade = overrides.pop("vignetting", None)
             inputs = inputs_of({name: overrides.pop(name) for name in _INPUTS & set(overrides)})

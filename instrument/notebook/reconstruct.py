@@ -126,8 +126,8 @@ def reconstruct(
         of how files are read (``dark``, ``crop``, ``binning``, ``erasures``, ``mosaic``, ``noise``), as
         values or in the words of the terminal (``dark="dark.tif"``, ``crop=(20, 30, 400, 600)``); ``dark``
         may be an image or array, too. And what is known of the light: ``vignetting``, relative light on the
-        photograph's own pixels (a file, image or array) that it is divided by; of arrays also ``background``
-        and ``patterns``, as :class:`~recon.reconstruction.measurement.Measurement` has them.
+        photograph's own pixels (a file, image or array) that it is divided by; of arrays also ``background``,
+        ``patterns`` and ``lines``, as :class:`~recon.reconstruction.measurement.Measurement` has them.
 
     Raises InputError, BenchError or FileError: what was found, what was expected, what to do.
     """
