@@ -199,6 +199,12 @@ def test_a_flat_field_in_counts_is_one_whatever_kind_its_numbers_are(
         db.reconstruct(photo, psf, vignetting=flat)
 
 
+@pytest.mark.parametrize("name", ["workers", "patterned"])
+def test_what_is_of_recordings_is_refused_of_a_photograph(name: str) -> None:
+    with pytest.raises(BenchError, match=f"{name}: for a recording, not for a photograph"):
+        db.forecast(np.ones((8, 8)), np.eye(8), **{name: 2})
+
+
 def test_options_are_completed_and_nothing_is_ignored(scene: tuple[np.ndarray, np.ndarray]) -> None:
     named = inspect.signature(db.reconstruct).parameters
     assert {o.name for o in options_of(ReconstructionOptions)} | {"dark", "crop"} <= set(named)

@@ -173,6 +173,10 @@ def forecast(
     with _telling(on_stage) as told:
         if (run_of_frames := recording_of(image)) is not None:
             return forecast_of_run(run_of_frames, psf, options, overrides, told)
+        shared = {o.name for kind in (ReconstructionOptions, InputOptions) for o in options_of(kind)}
+        of_runs = {o.name for o in options_of(VideoOptions)} - shared | {PATTERNED}
+        if about := sorted(of_runs & set(overrides)):
+            raise BenchError(f"{' and '.join(about)}: for a recording, not for a photograph. Leave it out.")
         asked = Asked.of(image, psf, options, overrides)
         return by_its_beginning.forecast(asked.measurement, asked.calibration, asked.options, told)
 
