@@ -36,6 +36,11 @@ LEAST_NOISE = 1e-5
 MOST_LIGHT = 1.5
 """Of relative light: what lies beyond is counts. A mean of 1 instead of a maximum leaves 1.5 seldom."""
 
+LINES_FOUND = "shared_lines_counts"
+"""Where lines were looked for in the photograph itself: its name among what was found."""
+LINES_SAID = "Whole lines of the photograph"
+"""How the warning of such lines begins."""
+
 MARKED = "Put numbers there, and mark them in erasures."
 """What helps where pixels of a measurement that are NaN are not erased by themselves."""
 

@@ -19,6 +19,8 @@ from recon.camera.refocus_field import at_depth, beyond_calibrated
 from recon.errors import InputError
 from recon.priors import PRIORS, Prior, TotalVariation
 from recon.reconstruction.measurement import (
+    LINES_FOUND,
+    LINES_SAID,
     Floats,
     Measurement,
     depths_of,
@@ -200,8 +202,11 @@ class Problem:
         """
         if self.reduction is not None:
             raise InputError("This problem was reduced for one photograph: choose anew for another.")
-        # Lines' offsets are noise: of each photograph its own.
-        measurement = replace(self.measurement, image=image, lines=None)
+        measurement, told = replace(self.measurement, image=image), self.warnings
+        if LINES_FOUND in measurement.found:  # they are noise: of each photograph its own
+            found = {name: value for name, value in measurement.found.items() if name != LINES_FOUND}
+            measurement = replace(measurement, lines=None, found=found)
+            told = tuple(words for words in told if not words.startswith(LINES_SAID))
         counts = measurement.channels()
         if counts.shape != self.data.shape or measurement.flat != self.flat:
             raise InputError(
@@ -210,7 +215,7 @@ class Problem:
         data = measurement.light_of(counts) / self.noise[:, None, None]
         if not self.valid.all():
             data = np.where(self.valid, data, 0)
-        other = replace(self, measurement=measurement, data=data)
+        other = replace(self, measurement=measurement, data=data, warnings=told)
         for name in {"energy", "levelled"} & set(self.__dict__):  # they are the PSFs', which stay
             other.__dict__[name] = self.__dict__[name]
         return other

@@ -247,13 +247,13 @@ class Replicas:
         self.misfit = float(size.max())
         # A fit takes some of the noise along. Erased pixels have as much: turned, they fall on others.
         self._rest = rest * np.maximum(1, 1 / size)[:, None, None]
-        rng = np.random.default_rng(0)
-        for left, valid in zip(self._rest, problem.valid, strict=True):
-            left[~valid] = rng.choice(left[valid], np.count_nonzero(~valid))
         # Noise grows where a shade was divided by: what falls elsewhere is to grow there.
         shade = problem.shade
         self._grown = np.float32(1) if shade is None else 1 / shade
         self._rest = self._rest / self._grown
+        rng = np.random.default_rng(0)
+        for left, valid in zip(self._rest, problem.valid, strict=True):
+            left[~valid] = rng.choice(left[valid], np.count_nonzero(~valid))
 
     def close(self) -> None:
         """Remove what the parts kept on disk."""

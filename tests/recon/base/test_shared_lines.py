@@ -208,7 +208,21 @@ def test_another_photograph_of_the_same_problem_has_no_lines_of_the_first() -> N
     )
     assert chosen.measurement.lines is not None
     other = photograph(psf)
-    np.testing.assert_allclose(chosen.with_data(other).data[0], other / chosen.noise[0], rtol=1e-5)
+    again = chosen.with_data(other)
+    np.testing.assert_allclose(again.data[0], other / chosen.noise[0], rtol=1e-5)
+    assert "shared_lines_counts" in chosen.measurement.found
+    assert again.measurement.found == {}
+    assert any("Whole lines" in words for words in chosen.warnings)
+    assert not any("Whole lines" in words for words in again.warnings)
+
+
+def test_lines_that_somebody_gave_are_taken_off_other_photographs_as_well() -> None:
+    psf, lines = broad_psf(), of_lines(50, 1)
+    given = Problem.of(Measurement(photograph(psf) + lines, lines=lines), psf)
+    other = photograph(psf)
+    again = given.with_data(other + lines)
+    np.testing.assert_allclose(again.data[0], other / given.noise[0], rtol=1e-4, atol=1e-3)
+    assert again.measurement.lines is not None
 
 
 def test_each_colour_has_lines_of_its_own() -> None:
