@@ -52,7 +52,8 @@ def forecast_of_run(
         request = PatternedRequest(
             run=run.path, sheet=Path(sheet), calibration=place, inputs=inputs, options=asked
         )
-        return forecast_patterned(prepare_patterned(request, _shared(on_stage, "patterns")), on_stage)
+        prepared = prepare_patterned(request, _shared(on_stage, "patterns"))
+        return forecast_patterned(prepared, lambda share, what: on_stage((1 + share) / 2, what))
     calibrated = place.is_dir() and (is_calibration(place) or is_run(place))
     with TemporaryDirectory() as folder:
         film = VideoRequest(

@@ -123,8 +123,18 @@ def test_what_it_takes_is_told_with_its_patterns_in_terminal_and_python(
     told = forecast_patterned(prepared)
     assert (told.settles, told.counted) == (4, True)
     assert 1000 < told.seconds < 1600, "what the patterns took is in it"
-    told = db.forecast(run, calibration, patterned=sheet, iterations=4, tolerance=0.0)
+    shares: list[float] = []
+    told = db.forecast(
+        run,
+        calibration,
+        patterned=sheet,
+        on_stage=lambda share, _: shares.append(share),
+        iterations=4,
+        tolerance=0.0,
+    )
     assert told.settles == 4
+    assert shares == sorted(shares)
+    assert 0.5 < shares[-1] <= 1
 
 
 def test_a_colour_camera_in_patterned_light(files: tuple[Path, Path, Path], tmp_path: Path) -> None:
