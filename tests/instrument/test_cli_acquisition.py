@@ -292,16 +292,16 @@ def test_a_point_source_is_warned_of_before_a_scene(
         '[simulated]\npreset = "tiny"\ntime_scale = 0\n'
     )
     true = SimulatedCamera._read_out
-    monkeypatch.setattr(SimulatedCamera, "_read_out", lambda *given: (true(*given)[0], 2e-5))
+    monkeypatch.setattr(SimulatedCamera, "_read_out", lambda *given: (true(*given)[0], 6e-5))
     words = ["--as-is", "--bench", str(here / "sim.toml"), "--exposure-ms", "1"]
     for light, warned in (("--source", True), ("--scene", False)):
         assert main(["snap", *words, light, "--out", str(here / f"photo{light}.tif")]) == 0
         told = capsys.readouterr()
-        assert ("Warning: 0.002 % of the pixels are saturated, of a PSF none may be;" in told.err) is warned
-        assert ("; 0.002 % of the pixels are saturated." in told.out) is not warned
+        assert ("Warning: 0.006 % of the pixels are saturated, of a PSF none may be;" in told.err) is warned
+        assert ("; 0.006 % of the pixels are saturated." in told.out) is not warned
         assert main(["record", light, "--frames", "2", *words]) == 0
         told = capsys.readouterr()
-        assert ("up to 0.002 % of them, of a PSF none may be; shorten" in told.err) is warned
+        assert ("up to 0.006 % of them, of a PSF none may be; shorten" in told.err) is warned
 
 
 def test_one_program_at_a_time_writes_to_a_run(here: Path, capsys: pytest.CaptureFixture[str]) -> None:
