@@ -3,7 +3,7 @@
 A checksum of prepared arrays is one of their last bits, which another processor, library or version of this
 program rounds otherwise. Marks are sums of an array's numbers under waves of many frequencies, relative to
 its norm: they move about as far as the array does. What moves less than a hundred-thousandth of the norm is
-not seen: one pixel of a photograph by a few counts, a plane at 30 mm by 0.2 um. Nor is where a number is none.
+not seen: one pixel of a photograph by a few counts, a plane at 30 mm by 0.2 um; nor which number is none.
 """
 
 from __future__ import annotations

@@ -13,8 +13,6 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from scipy.ndimage import gaussian_filter
-from scipy.optimize import nnls
 
 from recon.base.filling import fill_smoothly
 
@@ -39,8 +37,6 @@ through measured PSFs 0.10 to 0.18, of emission lines 0.03 to 0.05, of a point t
 0.18."""
 LEAST_LEFT = 0.5
 """Deviation of the offsets that are taken off, in units of a pixel's noise."""
-BLUR_PX = 3.0
-"""Of the picture that stands for pixels that are missing."""
 STEPS = 10
 """Of the fit of light, in lines."""
 DEPTHS = 5
@@ -125,24 +121,12 @@ def _offsets(image: Floats, valid: npt.NDArray[np.bool_], noise: float, psfs: np
 
 
 def _quarters(image: Floats, valid: npt.NDArray[np.bool_]) -> Floats:
-    """Return the means of each row's parts, (n, height), over valid pixels.
-
-    Where pixels are missing, a blurred picture has what the light there differs from that elsewhere.
-    """
+    """Return the means of each row's parts, (n, height); missing pixels are filled from around them."""
     parts = min(QUARTERS, image.shape[1])
-    if valid.all():
-        return np.stack([part.mean(axis=1) for part in np.array_split(image, parts, axis=1)])
-    filled = np.where(valid, image, 0)
-    fill_smoothly(filled, valid.astype(np.float64))
-    blurred = gaussian_filter(filled, BLUR_PX)
-    over = np.where(valid, image - blurred, 0)
-    split = (np.array_split(of, parts, axis=1) for of in (over, valid, blurred))
-    return np.stack(
-        [
-            o.sum(axis=1) / np.maximum(v.sum(axis=1), 1) + b.mean(axis=1)
-            for o, v, b in zip(*split, strict=True)
-        ]
-    )
+    if not valid.all():
+        image = np.where(valid, image, 0)
+        fill_smoothly(image, valid.astype(np.float64))
+    return np.stack([part.mean(axis=1) for part in np.array_split(image, parts, axis=1)])
 
 
 def _deviation(quarters: Floats, order: int) -> float:
@@ -164,6 +148,8 @@ def _left_by_light(means: Floats, rows: npt.NDArray[np.intp], psfs: npt.NDArray[
 
     Light of each row of the scene, none below zero, on the sensor and beyond.
     """
+    from scipy.optimize import nnls
+
     flat = psfs.reshape(-1, *psfs.shape[-2:])
     picked = flat[np.unique(np.linspace(0, len(flat) - 1, DEPTHS).round().astype(int))]
     lines = picked.sum(axis=-1, dtype=np.float64)
