@@ -203,10 +203,11 @@ def test_the_red_theme_shows_nothing_but_red(
     before = panel.volume.coloured.image
     try:
         list(change_theme("red", panel, [panel]))
-        qtbot.waitUntil(lambda: panel.volume.coloured.image is not before, timeout=WAIT_MS)
+        # One that was begun in the colours before may come in between.
+        qtbot.waitUntil(lambda: not panel.volume.coloured.image[..., 1:].any(), timeout=WAIT_MS)
         shown = panel.volume.coloured.image
+        assert shown is not before
         assert shown[..., 0].max() > 0.5
-        assert shown[..., 1:].max() == 0
         image = panel.volume.front.grab().toImage()
         middle = image.pixelColor(image.width() // 2, image.height() // 2)
         assert middle.red() >= middle.green() == middle.blue() == 0
