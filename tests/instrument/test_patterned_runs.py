@@ -148,8 +148,8 @@ def test_a_colour_camera_in_patterned_light(files: tuple[Path, Path, Path], tmp_
     image = read_image(out).pixels
     assert image.shape == (12, 14, 3)
     light = image.reshape(-1, 3).sum(axis=0)
-    # 19 % too much green in a window, 13 % in whole frames, with or without a background (6 % with one).
-    np.testing.assert_allclose(light / light[0], tint, rtol=0.25)
+    # Too much green: 19 % in a window (7 with a background below zero), 13 % in whole frames either way.
+    np.testing.assert_allclose(light / light[0], tint, rtol=0.2)
     truth = (scene() * lights().sum(axis=0))[:, 1:29].reshape(12, 2, 14, 2).mean(axis=(1, 3))
     for channel, least in enumerate((15, 15, 13)):  # red and blue of a quarter of the pixels
         assert psnr(image[..., channel], truth, fit_scale=True) > least
