@@ -2,21 +2,36 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
+_ROOT = Path(__file__).parents[2]
+
+
+def _all_of(folder: str, *, but: tuple[str, ...] = ()) -> tuple[str, ...]:
+    """Return every module of a folder, those of next week too; not compiled kernels, nor those of ``but``."""
+    names = sorted(file.name for file in (_ROOT / folder).glob("[!_]*.py"))
+    return tuple(f"{folder}/{name}" for name in names if name not in but)
+
+
 _RUNS = tuple(
     f"tests/instrument/runs/test_{name}.py"
     for name in (
         "acquire",
         "acquisition_simulated",
         "damage",
+        "export",
         "fault_injection",
         "finish",
         "frame_metadata",
+        "imported",
         "inspection",
         "interrupt",
         "log",
         "looked_at",
+        "pace",
         "recorder",
         "recorder_in_pieces",
+        "recording_rest",
         "resume",
         "run_control",
         "runner",
@@ -28,14 +43,16 @@ _RUNS = tuple(
     )
 )
 """Not test_signals.py: its programs are processes of their own."""
+_RUNNER = ("acquire.py", "pace.py", "recorder.py", "rehearsal.py", "run_control.py", "runner.py", "timed.py")
+_STREAM = ("buffered_camera.py", "running_camera.py", "stream.py", "stream_reader.py")
+_CHECKED = ("answers.py", "checked.py", "framing.py", "polled_stage.py", "serial_transport.py")
 AREAS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
     "safety": (
         (
             "instrument/bench/safety.py",
             "instrument/bench/bench.py",
             "instrument/bench/source_and_scene.py",
-            "drivers/common/answers.py",
-            "drivers/common/checked.py",
+            *(f"drivers/common/{name}" for name in _CHECKED),
         ),
         (
             "tests/instrument/bench/test_bench_safety.py",
@@ -44,19 +61,15 @@ AREAS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
             "tests/instrument/bench/test_bench_lock.py",
             "tests/drivers/test_answers.py",
             "tests/drivers/test_checked.py",
+            "tests/drivers/test_polled_stage.py",
+            "tests/drivers/test_serial_transport.py",
             "tests/drivers/test_simulated_faults.py",
             "tests/instrument/runs/test_acquisition_simulated.py",
             "tests/instrument/runs/test_timed.py",
         ),
     ),
     "runner": (
-        (
-            "instrument/runs/runner.py",
-            "instrument/runs/run_control.py",
-            "instrument/runs/recorder.py",
-            "instrument/runs/acquire.py",
-            "instrument/runs/timed.py",
-        ),
+        tuple(f"instrument/runs/{name}" for name in _RUNNER),
         (
             *_RUNS,
             "tests/drivers/test_answers.py",
@@ -66,15 +79,7 @@ AREAS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
     ),
     "store": (
         (
-            "instrument/runs/writer.py",
-            "instrument/runs/log.py",
-            "instrument/runs/run_files.py",
-            "instrument/runs/run.py",
-            "instrument/runs/repair.py",
-            "instrument/runs/finish.py",
-            "instrument/runs/interrupts.py",
-            "instrument/runs/frame_array.py",
-            "instrument/runs/inspection.py",
+            *_all_of("instrument/runs", but=_RUNNER),
             "instrument/files/atomic.py",
             "instrument/files/record.py",
         ),
@@ -88,18 +93,9 @@ AREAS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
     "drops": (("drivers/common/drops.py",), ("tests/drivers/test_drops.py",)),
     "streams": (
         (
-            "drivers/common/stream.py",
-            "drivers/common/stream_reader.py",
-            "drivers/common/buffered_camera.py",
-            "recon/streams/video.py",
-            "recon/streams/detail.py",
-            "recon/streams/fit.py",
-            "recon/streams/live.py",
-            "recon/streams/live_picture.py",
-            "recon/streams/pace.py",
-            "recon/streams/joint.py",
-            "recon/streams/stillness.py",
-            "instrument/live/live.py",
+            *(f"drivers/common/{name}" for name in _STREAM),
+            *_all_of("recon/streams"),
+            *_all_of("instrument/live"),
         ),
         (
             "tests/drivers/test_stream.py",
@@ -111,6 +107,7 @@ AREAS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
             "tests/drivers/test_simulated_contracts.py",
             "tests/drivers/test_v4l2.py",
             "tests/recon/video",
+            "tests/recon/activity",
             "tests/recon/live",
             "tests/instrument/live",
             "tests/instrument/video",
@@ -119,11 +116,7 @@ AREAS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
     ),
     "units": (
         (
-            "drivers/common/stage_axes.py",
-            "drivers/common/port_stage.py",
-            "drivers/common/pixels.py",
-            "drivers/common/unpacking.py",
-            "drivers/common/camera_settings.py",
+            *_all_of("drivers/common", but=("drops.py", *_STREAM, *_CHECKED)),
             "drivers/apt/drives.py",
             "drivers/grbl/settings.py",
             "drivers/zaber/stage.py",
@@ -150,22 +143,9 @@ AREAS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
     ),
     "solvers": (
         (
-            "recon/solvers/admm.py",
-            "recon/solvers/base.py",
-            "recon/solvers/cosine_preconditioner.py",
-            "recon/solvers/douglas_rachford.py",
-            "recon/solvers/fista.py",
-            "recon/solvers/moving.py",
-            "recon/solvers/operator_admm.py",
-            "recon/solvers/prior_splits.py",
-            "recon/solvers/sensor_admm.py",
-            "recon/solvers/splitting.py",
-            "recon/solvers/tv_admm_volume.py",
-            "recon/solvers/volume_admm.py",
-            "recon/solvers/wiener_filter.py",
+            *_all_of("recon/solvers"),
+            *_all_of("recon/priors"),
             "recon/base/filling.py",
-            "recon/priors/base.py",
-            "recon/priors/total_variation.py",
         ),
         (
             "tests/recon/solvers",
@@ -175,24 +155,44 @@ AREAS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
         ),
     ),
     "operators": (
+        _all_of("recon/camera", but=("vignetting.py",)),
         (
-            "recon/camera/base.py",
-            "recon/camera/convolution.py",
-            "recon/camera/factors.py",
-            "recon/camera/grid.py",
-            "recon/camera/points.py",
-            "recon/camera/spatially_varying.py",
-            "recon/camera/transformed.py",
-            "recon/camera/two_part.py",
-            "recon/camera/varying_psfs.py",
-        ),
-        (
+            "tests/recon/analysis/test_point_places.py",
             "tests/recon/auto/test_auto_rules.py",
             "tests/recon/camera",
+            "tests/recon/reconstruction/test_fitted_places.py",
+            "tests/recon/reconstruction/test_planes_beyond.py",
             "tests/recon/blind/test_points.py",
             "tests/recon/test_bayer_and_noise.py",
             "tests/recon/test_patterned.py",
             "tests/golden/test_golden.py",
+        ),
+    ),
+    "photographs": (
+        (
+            "instrument/reconstruction/matching.py",
+            "recon/base/shared_lines.py",
+            "recon/camera/vignetting.py",
+            "recon/reconstruction/background.py",
+            "recon/reconstruction/planes.py",
+        ),
+        (
+            "tests/instrument/test_matching.py",
+            "tests/recon/auto",
+            "tests/recon/base/test_shared_lines.py",
+            "tests/recon/reconstruction/test_background_of_pictures.py",
+            "tests/recon/reconstruction/test_dark_offset.py",
+            "tests/recon/reconstruction/test_planes_beyond.py",
+            "tests/recon/reconstruction/test_vignetting.py",
+        ),
+    ),
+    "verdict": (
+        _all_of("recon/verdict"),
+        (
+            "tests/recon/verdict",
+            "tests/recon/evaluation/test_failure.py",
+            "tests/recon/evaluation/test_map.py",
+            "tests/recon/evaluation/test_shipped.py",
         ),
     ),
 }
