@@ -191,6 +191,17 @@ def test_damaged_frames_count_as_lost_and_are_told_when_nothing_comes() -> None:
     assert "damaged" not in str(silence.value)
 
 
+def test_after_a_damaged_frame_no_more_is_waited_for_than_is_left() -> None:
+    def later() -> None:
+        now_s[0] += 0.75
+
+    queue = camera(later)
+    queue.start_sequence()
+    with pytest.raises(DeviceTimeoutError):
+        queue.next_frame(1.0)
+    assert queue.waits == [1.0, 0.25]
+
+
 def test_numbers_that_do_not_rise_are_borne_twice_in_a_row() -> None:
     queue = camera(1, 1, 1, 2, 2, 2, 2)
     queue.start_sequence()
