@@ -20,6 +20,8 @@ Floats = npt.NDArray[np.float64]
 
 QUARTERS = 4
 """Parts of each line, which have to agree."""
+LEAST_LINES = 13
+"""Fewer do not tell."""
 FINE, COARSE = 6, 2
 """Orders of differences between neighbouring lines: white noise has as much of both, light less of the
 finer."""
@@ -105,42 +107,39 @@ def _offsets(image: Floats, valid: npt.NDArray[np.bool_], noise: float, psfs: np
     """Return what each row has by itself; 0 where that may be light."""
     offsets = np.zeros(len(image))
     seen, across = valid.any(axis=1), valid.any(axis=0)
+    if np.count_nonzero(seen) < LEAST_LINES or np.count_nonzero(across) < QUARTERS:
+        return offsets
     quarters = _quarters(image[np.ix_(seen, across)], valid[np.ix_(seen, across)])
     own, coarse = _deviation(quarters, FINE), _deviation(quarters, COARSE)
-    if own < LEAST * noise or not WHITE[0] * coarse <= own <= WHITE[1] * coarse:
+    if own <= LEAST * noise or not WHITE[0] * coarse <= own <= WHITE[1] * coarse:
         return offsets
     means = quarters.mean(axis=0)
     left = _left_by_light(means, np.flatnonzero(seen), psfs)
-    pixel = noise**2 / np.count_nonzero(across)
-    if left is None or _fine(left) ** 2 - pixel < (UNEXPLAINED * _fine(means)) ** 2:
+    if left is None or _fine(left) < UNEXPLAINED * _fine(means):
         return offsets
     found = means - _smooth(means)
     if found.std() >= LEAST_LEFT * noise:
-        offsets[seen] = found - found.mean()
+        offsets[seen] = found
     return offsets
 
 
 def _quarters(image: Floats, valid: npt.NDArray[np.bool_]) -> Floats:
-    """Return the means of each row's parts, (n, height); missing pixels are filled from around them."""
-    parts = min(QUARTERS, image.shape[1])
+    """Return the means of each row's parts, (n, height); missing pixels are filled, in place."""
     if not valid.all():
-        image = np.where(valid, image, 0)
         fill_smoothly(image, valid.astype(np.float64))
-    return np.stack([part.mean(axis=1) for part in np.array_split(image, parts, axis=1)])
+    return np.stack([part.mean(axis=1) for part in np.array_split(image, QUARTERS, axis=1)])
 
 
 def _deviation(quarters: Floats, order: int) -> float:
     """Return the deviation of what the quarters of rows share, by differences of neighbours, counts."""
-    if len(quarters) < QUARTERS or quarters.shape[1] <= 2 * order:
-        return 0.0
     steps = np.diff(quarters, n=order, axis=1) / comb(2 * order, order) ** 0.5
     both = [float(np.mean(steps[i] * steps[j])) for i in range(QUARTERS) for j in range(i)]
     return float(np.sqrt(max(float(np.median(both)), 0.0)))
 
 
 def _fine(line: Floats) -> float:
-    """Return the deviation of a line's finer differences, in units of white noise's."""
-    return float(np.sqrt(np.mean(np.diff(line, n=FINE) ** 2) / comb(2 * FINE, FINE)))
+    """Return the size of a line's finer differences."""
+    return float(np.linalg.norm(np.diff(line, n=FINE)))
 
 
 def _left_by_light(means: Floats, rows: npt.NDArray[np.intp], psfs: npt.NDArray[Any]) -> Floats | None:
@@ -170,9 +169,8 @@ def _left_by_light(means: Floats, rows: npt.NDArray[np.intp], psfs: npt.NDArray[
 
 def _cast(line: Floats, rows: npt.NDArray[np.intp]) -> Floats:
     """Return what rows of the sensor get of each row of the scene by a PSF's sums, (rows, scene)."""
-    n, centre = len(line), len(line) // 2
-    scene = np.arange(rows[0] + centre - n + 1, rows[-1] + centre + 1)
-    at = rows[:, None] - scene + centre
+    n = len(line)
+    at = rows[:, None] - np.arange(rows[0] - n + 1, rows[-1] + 1)
     return np.where((at >= 0) & (at < n), line[np.clip(at, 0, n - 1)], 0)
 
 

@@ -80,6 +80,9 @@ def test_most_of_what_lines_share_is_found(axis: int) -> None:
     assert found is not None
     assert (found.image - offsets).std() < 0.6 * offsets.std()
     assert list(found.deviations) == [("columns", "rows")[axis]]
+    small = shared_lines((photograph(psf) + offsets) / 1e5, np.ones(SHAPE, bool), NOISE / 1e5, psf)
+    assert small is not None
+    assert small.deviations == pytest.approx({name: value / 1e5 for name, value in found.deviations.items()})
 
 
 def test_rows_and_columns_are_told_apart() -> None:
@@ -91,14 +94,45 @@ def test_rows_and_columns_are_told_apart() -> None:
     assert found.deviations["rows"] > found.deviations["columns"] > 20
 
 
-def test_erased_lines_and_pixels_do_not_hinder() -> None:
-    psf, offsets = broad_psf(), of_lines(50, 1)
+@pytest.mark.parametrize("axis", [0, 1])
+def test_erased_lines_and_pixels_do_not_hinder(axis: int) -> None:
+    psf, offsets = broad_psf(), of_lines(50, axis)
     valid = np.random.default_rng(0).random(SHAPE) > 0.02
-    valid[:, 50] = False
+    valid[:, 50] = valid[30] = False
     data = np.where(valid, photograph(psf) + offsets, 0)
     found = shared_lines(data, valid, NOISE, psf)
     assert found is not None
-    assert (found.image - offsets).std() < 0.6 * offsets.std()
+    assert (found.image - offsets)[valid].std() < 0.6 * offsets.std()
+    assert not found.columns[50]
+    assert not found.rows[30]
+
+
+@pytest.mark.parametrize(("rows", "columns"), [(12, 128), (96, 3)])
+def test_a_few_lines_tell_nothing(rows: int, columns: int) -> None:
+    psf, part = broad_psf(), (slice(rows), slice(columns))
+    even = 2000 + of_lines(200, 1)[part] + NOISE * np.random.default_rng(2).standard_normal((rows, columns))
+    assert shared_lines(even, np.ones(even.shape, bool), NOISE, psf[part]) is None
+
+
+@pytest.mark.parametrize("columns", [4, 128])
+def test_thirteen_lines_are_enough(columns: int) -> None:
+    psf = broad_psf()
+    noise = NOISE * np.random.default_rng(2).standard_normal((13, columns))
+    even = 2000 + of_lines(200, 1)[:13, :columns] + noise
+    assert shared_lines(even, np.ones(even.shape, bool), NOISE, psf) is not None
+
+
+def test_a_photograph_of_one_value_has_no_lines() -> None:
+    assert shared_lines(np.full(SHAPE, 1 / 3), np.ones(SHAPE, bool), 0.0, broad_psf()) is None
+
+
+@pytest.mark.parametrize("n", [5, 6])
+def test_rows_of_the_scene_cast_what_a_convolution_does_also_from_beyond_the_sensor(n: int) -> None:
+    """The centre pixel of n is n // 2; of a mosaic's colour the sensor has some rows only."""
+    line, rows = np.random.default_rng(0).random(n) + 0.1, np.array([3, 5, 7, 9])
+    scenes = np.eye(30)  # a lit row each, from -10 on
+    sums = np.array([np.convolve(scene, line)[n // 2 : n // 2 + 30][rows + 10] for scene in scenes]).T
+    np.testing.assert_allclose(module._cast(line, rows), sums[:, sums.any(axis=0)])
 
 
 def test_nothing_is_found_where_each_pixel_has_its_own_noise() -> None:
@@ -106,13 +140,22 @@ def test_nothing_is_found_where_each_pixel_has_its_own_noise() -> None:
     assert shared_lines(photograph(psf), np.ones(SHAPE, bool), NOISE, psf) is None
 
 
-def test_stripes_that_an_object_may_cast_are_left() -> None:
-    """Through a sharp PSF bars come as bars."""
+@pytest.mark.parametrize("dark_level", [0, 400])
+def test_stripes_that_an_object_may_cast_are_left(dark_level: int) -> None:
+    """Through a sharp PSF bars come as bars, also where too much was subtracted."""
     sharp = np.zeros(SHAPE, np.float32)
     sharp[SHAPE[0] // 2, SHAPE[1] // 2] = 1
     bars = 1000 * np.broadcast_to(np.random.default_rng(5).random((SHAPE[0], 1)) > 0.5, SHAPE)
     noisy = bars + NOISE * np.random.default_rng(2).standard_normal(SHAPE)
-    assert shared_lines(noisy, np.ones(SHAPE, bool), NOISE, sharp) is None
+    assert shared_lines(noisy - dark_level, np.ones(SHAPE, bool), NOISE, sharp) is None
+    assert shared_lines(noisy, np.ones(SHAPE, bool), NOISE, broad_psf()) is not None
+    assert shared_lines(noisy / 1e5, np.ones(SHAPE, bool), NOISE / 1e5, sharp) is None
+    sharp[SHAPE[0] // 2] = np.random.default_rng(6).random(SHAPE[1])  # along the bars it need not be
+    both = np.stack([broad_psf(), sharp])  # of two depths
+    for order in (both, both[::-1]):
+        assert shared_lines(noisy, np.ones(SHAPE, bool), NOISE, order) is None
+        columns = shared_lines(noisy.T.copy(), np.ones(SHAPE[::-1], bool), NOISE, np.swapaxes(order, 1, 2))
+        assert columns is None
 
 
 def test_one_bright_row_is_light_where_the_psf_is_a_point() -> None:
@@ -174,7 +217,7 @@ def test_what_rounding_leaves_of_an_estimated_noise_is_a_pixels() -> None:
     """A JPEG's noise is next to none, its lines differ by less than the step of its counts."""
     psf = broad_psf()
     noise = 0.3 * np.random.default_rng(2).standard_normal(SHAPE)
-    rounded = np.round(200 + of_lines(0.2, 1) + noise)
+    rounded = np.round(200 + of_lines(0.24, 1) + noise)  # 0.29 is a step's share
     assert shared_lines(rounded, np.ones(SHAPE, bool), 0.05, psf) is None
     assert shared_lines(rounded / 64, np.ones(SHAPE, bool), 0.05 / 64, psf) is None
     assert shared_lines(rounded + of_lines(1, 1).round(), np.ones(SHAPE, bool), 0.05, psf) is not None
