@@ -34,6 +34,12 @@ def test_a_frame_has_the_light_of_its_exposure_not_that_of_now(monkeypatch: pyte
         "nothing lit, then scene, then point source"
     )
     assert log.during(replace(frame, host_time_ns=-500 * MS)) == "", "before anything was known"
+    assert log.during(replace(frame, host_time_ns=1129 * MS)) == "nothing lit, then scene", (
+        "it may have come 30 ms late"
+    )
+    assert log.during(replace(frame, host_time_ns=1130 * MS)) == "scene"
+    assert log.during(replace(frame, host_time_ns=3000 * MS)) == "scene, then point source"
+    assert log.during(replace(frame, host_time_ns=50 * MS)) == "nothing lit"
 
 
 def test_what_the_operator_lights_is_not_known_before_he_was_asked() -> None:
@@ -50,6 +56,33 @@ def test_what_the_operator_lights_is_not_known_before_he_was_asked() -> None:
     assert words() == "nothing lit"
     lights.switch_scene(lit=True)
     assert words() == "scene"
+
+
+@pytest.mark.parametrize(
+    ("pattern", "scene", "knows_scene", "source", "words"),
+    [
+        ("half", False, True, False, "LEDs: half"),
+        ("half", True, True, False, "scene and LEDs: half"),
+        ("one LED", False, True, True, "point source"),
+        ("one LED", True, True, True, "scene and LEDs: one LED"),
+        ("", True, True, False, "scene"),
+        ("", False, True, False, "nothing lit"),
+        ("", False, False, False, "LEDs dark, scene not known"),
+    ],
+)
+def test_what_leds_and_scene_give_is_named(
+    pattern: str, scene: bool, knows_scene: bool, source: bool, words: str
+) -> None:
+    leds = SimpleNamespace(
+        is_open=True, pattern=SimpleNamespace(is_dark=not pattern, description=pattern or "dark")
+    )
+    bench: Any = SimpleNamespace(
+        led_array=leds, slm=None, scene_lit=scene, knows_scene=knows_scene, source_lit=source
+    )
+    assert light_words(bench) == words
+    leds.is_open = False
+    without = {(True, True): "scene", (False, True): "nothing lit", (False, False): "not known"}
+    assert light_words(bench) == without[scene, knows_scene]
 
 
 def test_a_screen_that_shows_something_is_light() -> None:

@@ -5,15 +5,18 @@ from __future__ import annotations
 import threading
 from collections import deque
 from collections.abc import Callable
-from typing import Any
+from types import SimpleNamespace
+from typing import Any, cast
 
 import pytest
 
 from drivers.common.stream import FrameStream
 from drivers.errors import DeviceError, DeviceLostError
+from drivers.frame import Frame
+from drivers.simulated.camera import SimulatedCamera
 from instrument.bench.bench import open_bench
 from instrument.bench.config_file import parse_config
-from instrument.live.live_camera import LiveCamera
+from instrument.live.live_camera import LiveCamera, LiveCameraStatus
 from tests.instrument.live.test_live_view import BENCH
 
 
@@ -94,3 +97,47 @@ def test_an_end_in_another_thread_does_not_disturb_who_counts() -> None:
         assert live.status().frames_per_s >= 0
         ending.join()
         assert not live._history
+
+
+def test_rates_are_of_the_last_two_seconds_and_counts_of_all_streams(monkeypatch: pytest.MonkeyPatch) -> None:
+    now_s = [100.0]
+    monkeypatch.setattr("instrument.live.live_camera.time", SimpleNamespace(monotonic=lambda: now_s[0]))
+    live = LiveCamera(None)
+    assert live.status() == LiveCameraStatus(running=False, frames_per_s=0.0, acquired=0, dropped=0)
+    assert live.newest() is live.stream is live.error is live.coarse() is None
+    live._history.clear()
+    live._stream = stream = cast(FrameStream, SimpleNamespace(acquired=0, dropped=0, is_running=True))
+    rates = []
+    for acquired in (0, 10, 20, 60, 100):  # a second each
+        stream.acquired, stream.dropped = acquired, acquired // 10
+        rates.append(live.status().frames_per_s)
+        now_s[0] += 1.0
+    assert rates == [0.0, 10.0, 10.0, 25.0, 40.0]
+    stream.close = lambda: None  # type: ignore[method-assign]
+    live.stop()
+    live._stream = cast(FrameStream, SimpleNamespace(acquired=5, dropped=1, is_running=True))
+    assert live.status() == LiveCameraStatus(running=True, frames_per_s=0.0, acquired=105, dropped=11)
+
+
+def test_what_a_run_has_newest_is_shown_while_it_has_the_camera() -> None:
+    frame = object()
+    live = LiveCamera(None)
+    with live.watching(lambda: cast(Frame, frame)):
+        assert live.newest() is frame
+    assert live.newest() is None
+
+
+def test_a_simulated_camera_is_asked_for_coarse_light_while_somebody_looks_only() -> None:
+    with open_bench(parse_config(BENCH, None)) as bench:
+        camera = bench.camera
+        assert isinstance(camera, SimulatedCamera)
+        camera.coarse = lambda: "coarsely"  # type: ignore[method-assign, assignment, return-value]
+        live = LiveCamera(camera)
+        assert live.coarse() is None
+        live.start()
+        live.start()  # does nothing
+        assert camera.coarse_first
+        assert live.coarse() == "coarsely"
+        live.stop()
+        assert not camera.coarse_first
+        assert live.coarse() is None
