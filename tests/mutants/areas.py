@@ -180,6 +180,7 @@ AREAS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
             "tests/instrument/test_matching.py",
             "tests/recon/auto",
             "tests/recon/base/test_shared_lines.py",
+            "tests/recon/camera/test_shade.py",
             "tests/recon/reconstruction/test_background_of_pictures.py",
             "tests/recon/reconstruction/test_dark_offset.py",
             "tests/recon/reconstruction/test_planes_beyond.py",

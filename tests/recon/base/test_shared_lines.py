@@ -126,6 +126,19 @@ def test_a_photograph_of_one_value_has_no_lines() -> None:
     assert shared_lines(np.full(SHAPE, 1 / 3), np.ones(SHAPE, bool), 0.0, broad_psf()) is None
 
 
+@pytest.mark.parametrize("noise", [1.0, 10.0])
+def test_light_is_the_curve_of_least_bending_that_cross_validation_asks_for(noise: float) -> None:
+    """As dense matrices: of second differences, mirrored at the ends."""
+    n = 40
+    line = 20 * np.cos(np.arange(n) / 5) + noise * np.random.default_rng(1).standard_normal(n)
+    second = np.diff(np.eye(n), axis=0).T @ np.diff(np.eye(n), axis=0)
+    hats = [np.linalg.inv(np.eye(n) + stiff * second @ second) for stiff in module.STIFFNESS]
+    scores = [np.sum((line - hat @ line) ** 2) / (n - np.trace(hat)) ** 2 for hat in hats]
+    best = int(np.argmin(scores))
+    assert 0 < best < len(hats) - 1
+    np.testing.assert_allclose(module._smooth(line), hats[best] @ line, atol=1e-6)
+
+
 @pytest.mark.parametrize("n", [5, 6])
 def test_rows_of_the_scene_cast_what_a_convolution_does_also_from_beyond_the_sensor(n: int) -> None:
     """The centre pixel of n is n // 2; of a mosaic's colour the sensor has some rows only."""
@@ -151,7 +164,7 @@ def test_stripes_that_an_object_may_cast_are_left(dark_level: int) -> None:
     assert shared_lines(noisy, np.ones(SHAPE, bool), NOISE, broad_psf()) is not None
     assert shared_lines(noisy / 1e5, np.ones(SHAPE, bool), NOISE / 1e5, sharp) is None
     sharp[SHAPE[0] // 2] = np.random.default_rng(6).random(SHAPE[1])  # along the bars it need not be
-    both = np.stack([broad_psf(), sharp])  # of two depths
+    both = np.stack([broad_psf(), sharp, 0 * sharp])  # of depths, one without light
     for order in (both, both[::-1]):
         assert shared_lines(noisy, np.ones(SHAPE, bool), NOISE, order) is None
         columns = shared_lines(noisy.T.copy(), np.ones(SHAPE[::-1], bool), NOISE, np.swapaxes(order, 1, 2))

@@ -1,0 +1,98 @@
+"""The shade that falls off towards a photograph's edges: what its numbers are, and how they are fitted."""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+
+from recon.camera.vignetting import DEEPEST, ENOUGH, LEAST, NUMBERS, least_squares, shade_of
+
+Floats = npt.NDArray[np.float64]
+RNG = np.random.default_rng(3)
+SLOPES = RNG.standard_normal((40, NUMBERS))
+
+
+def never(_: Floats) -> bool:
+    return False
+
+
+@pytest.mark.parametrize("shape", [(31, 41), (40, 24)])
+def test_numbers_of_a_shade_are_of_squares_fourth_power_and_slopes(shape: tuple[int, int]) -> None:
+    numbers = np.array([0.4, 0.7, 0.2, 0.3, -0.5])
+    half = max(shape) / 2
+    light = np.zeros(shape)
+    for row in range(shape[0]):
+        for column in range(shape[1]):
+            y, x = (row - (shape[0] - 1) / 2) / half, (column - (shape[1] - 1) / 2) / half
+            fallen = 0.4 * x**2 + 0.7 * y**2 + 0.2 * (x**2 + y**2) ** 2 + 0.3 * x - 0.5 * y
+            light[row, column] = np.exp(-fallen)
+    np.testing.assert_allclose(shade_of(numbers, shape), light / light.max(), rtol=1e-5)
+
+
+def test_no_shade_is_deeper_than_the_deepest() -> None:
+    assert shade_of(np.array([9.0, 9.0, 0, 0, 0]), (30, 30)).min() == np.float32(DEEPEST)
+
+
+def test_what_is_fitted_has_the_least_misfit_and_penalty() -> None:
+    wanted = 10 * RNG.standard_normal(len(SLOPES))
+    found = least_squares(lambda n: SLOPES @ n - wanted, np.zeros(NUMBERS), never)
+    assert found is not None
+    normal = SLOPES.T @ SLOPES / len(SLOPES) + LEAST * np.eye(NUMBERS)
+    best = np.linalg.solve(normal, SLOPES.T @ wanted / len(SLOPES))
+    np.testing.assert_allclose(found, best, rtol=0.03, atol=0.01)
+
+
+def test_it_goes_on_from_where_it_is_told_to() -> None:
+    """From the best there is nothing to gain: no step is taken twice."""
+    wanted = 10 * RNG.standard_normal(len(SLOPES))
+    normal = SLOPES.T @ SLOPES / len(SLOPES) + LEAST * np.eye(NUMBERS)
+    best = np.linalg.solve(normal, SLOPES.T @ wanted / len(SLOPES))
+    tried: list[Floats] = []
+
+    def left(numbers: Floats) -> Floats:
+        tried.append(numbers)
+        return np.asarray(SLOPES @ numbers - wanted)
+
+    found = least_squares(left, best, never)
+    np.testing.assert_allclose(found, best, atol=1e-6)
+    np.testing.assert_array_equal(tried[0], best)
+    assert len(tried) <= 1 + NUMBERS + 6  # one try at each damping, at most
+
+
+def test_it_ends_where_no_more_is_left_than_usual_errors_leave() -> None:
+    """A reconstruction each: none is made for nothing."""
+    truth = 0.2 * RNG.standard_normal(NUMBERS)
+    tried: list[float] = []
+
+    def left(numbers: Floats) -> Floats:
+        rest = np.asarray(SLOPES @ (numbers - truth) + 0.5)
+        tried.append(float(np.mean(rest**2)))
+        return rest
+
+    found = least_squares(left, truth + 2, never)
+    assert found is not None
+    assert tried[0] > ENOUGH > tried[-1]
+    assert len(tried) == 1 + NUMBERS + 1
+
+
+def test_a_step_that_goes_too_far_is_damped() -> None:
+    def left(numbers: Floats) -> Floats:
+        return np.asarray(50 * np.arctan(np.append(numbers - 2.0, numbers[0] - 2.0)))
+
+    start = np.array([6.0, 2.0, 2.0, 2.0, 2.0])  # Newton's own steps go ever farther from there
+    found = least_squares(left, start, never)
+    assert found is not None
+    np.testing.assert_allclose(found, 2.0, atol=0.05)
+
+
+def test_what_comes_to_the_deepest_shade_is_none() -> None:
+    wanted = SLOPES @ np.full(NUMBERS, 3.0)
+    seen: list[Floats] = []
+
+    def is_deepest(numbers: Floats) -> bool:
+        seen.append(numbers)
+        return bool(numbers[0] > 1)
+
+    assert least_squares(lambda n: SLOPES @ n - wanted, np.zeros(NUMBERS), is_deepest) is None
+    assert len(seen) == 1
