@@ -50,15 +50,14 @@ def _terms(shape: tuple[int, int]) -> Floats:
     return np.stack([columns**2, rows**2, (columns**2 + rows**2) ** 2, columns, rows])
 
 
-def least_squares(
-    left: Callable[[Floats], Floats], numbers: Floats, deepest: Callable[[Floats], bool]
-) -> Floats | None:
-    """Return the numbers of least mean square and penalty, by Levenberg's steps from those given.
+def least_squares(left: Callable[[Floats], Floats], deepest: Callable[[Floats], bool]) -> Floats | None:
+    """Return the numbers of a shade of least mean square and penalty, by Levenberg's steps from none.
 
     None as soon as a step comes to a shade that is ``deepest``: it is none, however much it explains.
     """
-    firm, rest = FIRM, left(numbers)
-    least = float(np.mean(rest**2)) + LEAST * float(numbers @ numbers)
+    firm, numbers = FIRM, np.zeros(NUMBERS)
+    rest = left(numbers)
+    least = float(np.mean(rest**2))
     for _ in range(STEPS):
         moves = DIFFERENCE * np.eye(len(numbers))
         slopes = np.stack([(left(numbers + move) - rest) / DIFFERENCE for move in moves], axis=1)

@@ -19,7 +19,7 @@ import numpy.typing as npt
 
 from recon.base.blocks import whole_blocks
 from recon.camera.camera_model import CAMERAS
-from recon.camera.vignetting import DEEPEST, NUMBERS, least_squares, shade_of
+from recon.camera.vignetting import DEEPEST, least_squares, shade_of
 from recon.errors import InputError
 from recon.priors import Prior
 from recon.reconstruction.choice import Decision
@@ -449,7 +449,7 @@ def _shade_fitted(channel: Problem, usual2: float) -> Floats | None:
     def is_deepest(numbers: Floats) -> bool:
         return bool(shade_of(numbers, channel.sensor_shape).min() <= np.float32(DEEPEST))
 
-    return least_squares(left, np.zeros(NUMBERS), is_deepest)
+    return least_squares(left, is_deepest)
 
 
 def _shade_left(channel: Problem, shade: npt.NDArray[np.float32], iterations: int) -> Floats:

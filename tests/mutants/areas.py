@@ -183,6 +183,7 @@ AREAS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
             "tests/recon/camera/test_shade.py",
             "tests/recon/reconstruction/test_background_of_pictures.py",
             "tests/recon/reconstruction/test_dark_offset.py",
+            "tests/recon/reconstruction/test_light_restored.py",
             "tests/recon/reconstruction/test_planes_beyond.py",
             "tests/recon/reconstruction/test_vignetting.py",
         ),
