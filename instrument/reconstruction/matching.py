@@ -86,7 +86,9 @@ def matched(psf: ImageFile, image: ImageFile, *, mosaic: bool) -> Matched:
     if psf.is_colour and not (image.is_colour or mosaic):
         psf = replace(psf, pixels=psf.pixels.mean(axis=-1, dtype=np.float32))
         warnings += (MEAN_COLOUR,)
-    ours, theirs = whole_binnings(psf.pixels.shape[:2], image.pixels.shape[:2]) or (1, 1)
+    binnings = whole_binnings(psf.pixels.shape[:2], image.pixels.shape[:2])
+    assert binnings is not None
+    ours, theirs = binnings
     if ours == theirs == 1:
         return Matched(psf, warnings=warnings)
     warnings += (binned_words(psf.pixels.shape, image.pixels.shape, ours, theirs),)

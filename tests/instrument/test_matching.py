@@ -10,9 +10,16 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
+from instrument.files.errors import FileError
 from instrument.files.images import ImageFile
 from instrument.reconstruction.job import Job, job_from_files, job_with
-from instrument.reconstruction.matching import whole_binnings
+from instrument.reconstruction.matching import (
+    MEAN_COLOUR,
+    check_pair,
+    matched,
+    matched_calibration,
+    whole_binnings,
+)
 from instrument.reconstruction.options import InputOptions
 from instrument.reconstruction.preparation import Crop
 from recon import reconstruct
@@ -111,6 +118,72 @@ def test_of_a_psf_with_colours_a_grey_photograph_takes_the_mean(pair: tuple[Pixe
 )
 def test_binnings_are_whole_and_few(psf: Any, image: Any, binnings: Any) -> None:
     assert whole_binnings(psf, image) == binnings
+
+
+def of_shape(*shape: int, dtype: type = np.uint16) -> ImageFile:
+    return ImageFile(Path("a.tif"), np.zeros(shape, dtype))
+
+
+@pytest.mark.parametrize("colours", [(), (3,)])
+def test_what_no_whole_binning_brings_together_is_refused(colours: tuple[int, ...]) -> None:
+    for fits in ((60, 80), (30, 40), (180, 241)):
+        check_pair(of_shape(*fits, *colours), of_shape(60, 80, *colours))
+    with pytest.raises(FileError, match="a whole multiple of the other's") as refused:
+        check_pair(of_shape(60, 80, *colours), of_shape(50, 80, *colours))
+    assert "rotated" not in str(refused.value)
+    with pytest.raises(FileError, match="One of them may be rotated"):
+        check_pair(of_shape(60, 80, *colours), of_shape(80, 60, *colours))
+
+
+def test_pixels_of_a_mosaic_are_not_averaged() -> None:
+    check_pair(of_shape(60, 80), of_shape(60, 80), mosaic=True)
+    with pytest.raises(FileError, match=r"must have one shape\.") as refused:
+        check_pair(of_shape(30, 40), of_shape(60, 80), mosaic=True)
+    assert "multiple" not in str(refused.value)
+
+
+def test_one_of_two_bit_depths_was_converted() -> None:
+    for other in (np.uint16, np.float32):  # of numbers that are no counts nobody knows
+        check_pair(of_shape(4, 4, dtype=other), of_shape(4, 4))
+        check_pair(of_shape(4, 4), of_shape(4, 4, dtype=other))
+    eight = of_shape(4, 4, dtype=np.uint8)
+    with pytest.raises(FileError, match=r"PSF has 8 bit, but the image a\.tif has 16 bit"):
+        check_pair(eight, of_shape(4, 4))
+    check_pair(eight, of_shape(4, 4), allow_mixed_depth=True)
+
+
+def test_a_colour_pair_keeps_its_colours(pair: tuple[Pixels, Pixels]) -> None:
+    psf, photograph = (np.stack([image, image // 2, image // 4], axis=-1) for image in pair)
+    made = job(psf, photograph[::2, ::2], dark=0.0)
+    assert made.measurement.shape == photograph[::2, ::2].shape
+    assert made.calibration.psfs.shape == (1, 3, *photograph[::2, ::2].shape[:2])
+    assert len(made.warnings) == 1
+    grey, colour = of_shape(4, 4), of_shape(4, 4, 3)
+    assert not matched(grey, colour, mosaic=False).warnings
+    assert matched(colour, grey, mosaic=True).psf.is_colour
+    lit = replace(made.calibration, background=np.ones((3, *made.calibration.psfs.shape[-2:]), np.float32))
+    for image, mosaic in ((colour, False), (grey, True)):
+        assert matched_calibration(lit, image, mosaic=mosaic) == (lit, "")
+    one, words = matched_calibration(lit, grey, mosaic=False)
+    assert (one.psfs.shape[1], words) == (1, MEAN_COLOUR)
+    assert one.background is not None
+    np.testing.assert_array_equal(one.background, np.ones((1, *lit.psfs.shape[-2:])))
+    assert matched_calibration(one, grey, mosaic=False) == (one, "")
+    assert matched_calibration(replace(one, background=None), grey, mosaic=False)[0].background is None
+
+
+def test_a_dark_frame_of_both_is_taken_off_both_and_one_of_colours_by_colour(
+    pair: tuple[Pixels, Pixels],
+) -> None:
+    psf, photograph = pair
+    dark = ImageFile(Path("dark.tif"), np.full_like(photograph, 60))
+    made = job(psf, photograph, dark=dark)
+    np.testing.assert_allclose(made.measurement, photograph - 60.0)
+    np.testing.assert_allclose(made.calibration.psfs[0, 0], psf - 60.0)
+    assert "from the PSF" not in made.notes["Dark"]
+    colours = [np.stack([image] * 3, axis=-1) for image in pair]
+    made = job(*colours, dark=ImageFile(Path("dark.tif"), np.full_like(colours[1], 60)))
+    np.testing.assert_allclose(made.calibration.psfs[0, 2], psf - 60.0)
 
 
 @pytest.mark.skipif(
