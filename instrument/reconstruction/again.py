@@ -17,7 +17,7 @@ from instrument.reconstruction.options import InputOptions
 from instrument.reconstruction.request import PREPARED, PSF_STACK, READ_WITH, volume_job
 from instrument.reconstruction.stored_result import StoredResult
 from recon.base.declare import require, with_overrides
-from recon.base.marks import are_alike
+from recon.base.marks import Likeness, likeness
 from recon.base.noise import NoiseModel
 from recon.reconstruction.measurement import Measurement
 from recon.types import Calibration
@@ -75,26 +75,29 @@ def made_of(result: StoredResult) -> MadeOf:
     job = volume_job(psfs, image, inputs)
     pixels, then = told["image"].get("pixels_sha256"), told.get(PREPARED)
     then, now = then if isinstance(then, Mapping) else {}, prepared_record(job)
+    is_same = pixels == job.provenance["image"]["pixels_sha256"]
     alike = {
-        "photograph": pixels == job.provenance["image"]["pixels_sha256"] if isinstance(pixels, str) else None,
-        "PSFs": are_alike(then.get(PSFS), now[PSFS]),
-        "dark frame, background and mask": are_alike(then.get(MEASUREMENT), now[MEASUREMENT]),
+        "photograph": (Likeness.SAME if is_same else Likeness.OTHER)
+        if isinstance(pixels, str)
+        else Likeness.UNKNOWN,
+        "PSFs": likeness(then.get(PSFS), now[PSFS]),
+        "dark frame, background and mask": likeness(then.get(MEASUREMENT), now[MEASUREMENT]),
     }
-    if alike["photograph"] is False:
+    if alike["photograph"] is Likeness.OTHER:
         raise FileError(
             image,
             f"is not the photograph any more that {result.path} was made of: its pixels differ.",
             "Put the photograph back, or reconstruct this one.",
         )
-    if alike["PSFs"] is False:
+    if alike["PSFs"] is Likeness.OTHER:
         raise FileError(
             psfs,
             f"holds other PSFs than those that {result.path} was made of.",
             "Put those back, or reconstruct the volume again.",
         )
-    if alike["dark frame, background and mask"] is False:
+    if alike["dark frame, background and mask"] is Likeness.OTHER:
         cause = "its dark frame, the calibration's background or the mask of --erasures has changed since"
-        if alike["photograph"] is None:
+        if alike["photograph"] is Likeness.UNKNOWN:
             cause += ", or it is another photograph"
         raise FileError(
             result.path,
@@ -104,19 +107,24 @@ def made_of(result: StoredResult) -> MadeOf:
     measurement, calibration = job.as_measurement(inputs.noise), job.calibration
     if _is_merged(result):
         measurement, calibration = _in_grey(measurement, calibration)
-    return MadeOf(
-        measurement, calibration, _not_checked([what for what, known in alike.items() if known is None])
-    )
+    return MadeOf(measurement, calibration, _doubt(alike))
 
 
-def _not_checked(what: list[str]) -> str:
-    """Say what of a volume's inputs its record does not tell from others; nothing where it tells all."""
-    if not what:
-        return ""
-    return (
-        f"the volume's record does not tell its {', '.join(what)} from others, as one of a version before "
-        "2026-12: whether they have changed since was not checked."
-    )
+def _doubt(alike: Mapping[str, Likeness]) -> str:
+    """Say what of a volume's inputs its record does not tell, or not to the last bit; else nothing."""
+    of = {kind: ", ".join(what for what, known in alike.items() if known is kind) for kind in Likeness}
+    said = []
+    if unknown := of[Likeness.UNKNOWN]:
+        said.append(
+            f"the volume's record does not tell its {unknown} from others, as one of a version before "
+            "2026-12: whether they have changed since was not checked."
+        )
+    if near := of[Likeness.NEAR]:
+        said.append(
+            f"its {near} are not to the last bit those of then: rounded otherwise by another processor or "
+            "version, or changed by less than a hundred-thousandth, which is not told from that."
+        )
+    return " ".join(said)
 
 
 def _in_grey(measurement: Measurement, calibration: Calibration) -> tuple[Measurement, Calibration]:

@@ -1,14 +1,17 @@
-"""Numbers that tell what a reconstruction was made of from anything else, rounding excepted.
+"""Numbers that tell what a reconstruction was made of from anything else, and to the last bit.
 
 A checksum of prepared arrays is one of their last bits, which another processor, library or version of this
 program rounds otherwise. Marks are sums of an array's numbers under waves of many frequencies, relative to
 its norm: they move about as far as the array does. What moves less than a hundred-thousandth of the norm is
-not seen: one pixel of a photograph by a few counts, a plane at 30 mm by 0.2 um; nor which number is none.
+not told from rounding: one pixel of a photograph by a few counts, a plane at 30 mm by 0.2 um. The checksum
+beside them tells whether anything moved at all. Numbers that are none have marks of their own.
 """
 
 from __future__ import annotations
 
+import zlib
 from collections.abc import Mapping
+from enum import Enum
 from typing import Any
 
 import numpy as np
@@ -17,40 +20,78 @@ import numpy.typing as npt
 _MARKS, _PIECE = 8, 1 << 16
 _APART = 1e-5
 """Of an array's norm: other PSFs and photographs are hundreds of times as far apart, rounding a hundredth."""
+_BITS, _GAPS, _NORM = "crc32", "gaps", "norm"
+_NO_GAPS = [0.0] * (_MARKS + 1)
+"""Of a record of before 2026-12, which counted numbers that are none as 0: none, as far as it tells."""
 Marks = dict[str, list[float]]
 
 
+class Likeness(Enum):
+    """How much arrays are those whose marks were noted."""
+
+    UNKNOWN = "nothing tells"
+    OTHER = "others"
+    NEAR = "as near as rounding, which a small change is not told from"
+    SAME = "to the last bit"
+
+
 def marks_of(array: npt.NDArray[Any]) -> Marks:
-    """Return an array's shape, norm and marks, as JSON holds them; numbers that are none count as 0."""
+    """Return an array's shape, norm, marks and checksum, as JSON holds them.
+
+    Numbers that are none count as 0 among these; ``gaps`` tells how many they are, and which.
+    """
     flat = np.ascontiguousarray(array).reshape(-1)
-    wave = np.arange(1, _MARKS + 1)
-    within = np.cos(np.outer(2 * np.pi * np.modf(wave * 2**0.5)[0], np.arange(_PIECE)) + wave[:, None])
+    norm, marks = _marks(flat)
+    gaps = ~np.isfinite(flat) if flat.dtype.kind == "f" else np.zeros(1, bool)
+    return {
+        "shape": [*map(float, array.shape)],
+        _NORM: [norm],
+        "marks": marks,
+        _GAPS: [float(np.count_nonzero(gaps)), *_marks(gaps)[1]] if gaps.any() else _NO_GAPS,
+        _BITS: [float(zlib.crc32(flat.data))],
+    }
+
+
+def _marks(flat: npt.NDArray[Any]) -> tuple[float, list[float]]:
+    """Return the norm of numbers in a row, and their marks relative to it."""
+    wave, longest = np.arange(1, _MARKS + 1), min(flat.size, _PIECE)
+    within = np.cos(np.outer(2 * np.pi * np.modf(wave * 2**0.5)[0], np.arange(longest)) + wave[:, None])
     sums, square = np.zeros(_MARKS), 0.0
     for number, start in enumerate(range(0, flat.size, _PIECE)):
         piece = np.nan_to_num(flat[start : start + _PIECE].astype(np.float64), posinf=0.0, neginf=0.0)
         sums += np.cos(number * wave * 3**0.5 + wave) * (within[:, : piece.size] @ piece)
         square += float(piece @ piece)
     norm = square**0.5
-    return {"shape": [*map(float, array.shape)], "norm": [norm], "marks": [*(sums / (norm or 1.0)).tolist()]}
+    return norm, (sums / (norm or 1.0)).tolist()
 
 
-def are_alike(then: object, now: list[Marks]) -> bool | None:
-    """Whether marks that a record tells are those of now but for rounding; None where it tells none."""
+def likeness(then: object, now: list[Marks]) -> Likeness:
+    """Return how much arrays are those whose marks a record tells."""
     if not isinstance(then, list) or not then or not all(isinstance(one, Mapping) for one in then):
-        return None
+        return Likeness.UNKNOWN
     if len(then) != len(now):
-        return False
-    told = []
-    for one, other in zip(then, now, strict=True):
-        for name, values in other.items():
-            try:
-                known = np.asarray(one.get(name), np.float64)
-            except (TypeError, ValueError, OverflowError):
-                return None
-            if known.ndim != 1 or not np.isfinite(known).all():
-                return None
-            scale = max(abs(values[0]), 1e-300) if name == "norm" else 1.0
-            told.append(
-                known.shape == np.shape(values) and bool((abs(known - values) <= _APART * scale).all())
-            )
-    return all(told)
+        return Likeness.OTHER
+    found = [_likeness(one, other) for one, other in zip(then, now, strict=True)]
+    order = (Likeness.UNKNOWN, Likeness.OTHER, Likeness.NEAR, Likeness.SAME)
+    return min(found, key=order.index)
+
+
+def _likeness(one: Mapping[str, Any], now: Marks) -> Likeness:
+    """Return how much one array is that whose marks a record tells."""
+    if _GAPS not in one and now[_GAPS] != _NO_GAPS:
+        return Likeness.UNKNOWN
+    alike = True
+    for name, values in now.items():
+        if name == _BITS:
+            continue
+        try:
+            known = np.asarray(one.get(name, _NO_GAPS if name == _GAPS else None), np.float64)
+        except (TypeError, ValueError, OverflowError):
+            return Likeness.UNKNOWN
+        if known.ndim != 1 or not np.isfinite(known).all():
+            return Likeness.UNKNOWN
+        scale = max(abs(values[0]), 1e-300) if name == _NORM else 1.0
+        alike &= known.shape == np.shape(values) and bool((abs(known - values) <= _APART * scale).all())
+    if not alike:
+        return Likeness.OTHER
+    return Likeness.SAME if one.get(_BITS) == now[_BITS] else Likeness.NEAR

@@ -17,7 +17,7 @@ from instrument.files.record import of_kind
 from instrument.reconstruction.job import source_record
 from instrument.reconstruction.stored_result import _TOLD, open_result
 from instrument.volumes.grid_facts import grid_of
-from recon.base.marks import are_alike, marks_of
+from recon.base.marks import Likeness, likeness, marks_of
 
 RESULTS = Path(__file__).parents[1] / "fixtures" / "v813d646" / "results"
 RNG = np.random.default_rng(4)
@@ -141,32 +141,56 @@ def test_numbers_that_are_no_sizes_are_not_known() -> None:
             parse_json(text)
 
 
+UNKNOWN, OTHER, NEAR, SAME = Likeness
+
+
 def test_marks_are_the_same_but_for_rounding_and_no_others() -> None:
     array = RNG.gamma(1.0, 100.0, (3, 170, 260)).astype(np.float32)  # of more than one piece
     marks = marks_of(array)
     told = json.loads(json.dumps(marks))
-    assert are_alike([told], [marks_of(array * (1 + 3e-7 * RNG.standard_normal(array.shape)))])
+    assert likeness([told], [marks_of(array.copy())]) is SAME
+    assert likeness([told], [marks_of(array * (1 + 3e-7 * RNG.standard_normal(array.shape)))]) is NEAR
+    a_little = array.copy()
+    a_little[0, 0, 0] *= 1.01
+    assert likeness([told], [marks_of(a_little)]) is NEAR, "said, though not told from rounding"
     one = array.copy()
     one[1, 80, 100] += 0.01 * np.linalg.norm(array)
     swapped = array.reshape(-1).copy()
     swapped[[5, 70_000]] = 0.0, 9000.0
     moved = array.reshape(-1).copy()
     moved[[5, 70_000]] = 9000.0, 0.0
-    assert are_alike([marks_of(swapped)], [marks_of(moved)]) is False
+    assert likeness([marks_of(swapped)], [marks_of(moved)]) is OTHER
     others = (one, np.roll(array, 1, 2), np.roll(array, 1, 0), array[::-1], array + 1, 1.001 * array, array.T)
     for other in (*others, array[:, :, :-1], np.concatenate([array, 0 * array[:1]])):
-        assert are_alike([told], [marks_of(np.asarray(other))]) is False
-    assert are_alike([told, told], [marks]) is False
+        assert likeness([told], [marks_of(np.asarray(other))]) is OTHER
+    assert likeness([told, told], [marks]) is OTHER
+    assert likeness([told, told], [marks, marks_of(one)]) is OTHER
     kept = np.array([[True, False, True]])
-    assert are_alike([marks_of(kept)], [marks_of(kept)])
-    assert are_alike([marks_of(kept)], [marks_of(~kept)]) is False
-    assert are_alike([marks_of(np.zeros(3))], [marks_of(np.zeros(3))])
+    assert likeness([marks_of(kept)], [marks_of(kept)]) is SAME
+    assert likeness([marks_of(kept)], [marks_of(~kept)]) is OTHER
+    assert likeness([marks_of(np.zeros(3))], [marks_of(np.zeros(3))]) is SAME
     for wrong in (None, 3, [], [3], [{**told, "marks": None}], [{**told, "norm": ["a"]}]):
-        assert are_alike(wrong, [marks]) is None
+        assert likeness(wrong, [marks]) is UNKNOWN
     for wrong in (
         [{**told, "marks": [float("nan")]}],
         [{**told, "shape": [10**400]}],
         [{**told, "norm": 1.0}],
+        [{**told, "gaps": None}],
     ):
-        assert are_alike(wrong, [marks]) is None
-    assert are_alike([{**told, "marks": [0.0]}], [marks]) is False
+        assert likeness(wrong, [marks]) is UNKNOWN
+    assert likeness([{**told, "marks": [0.0]}], [marks]) is OTHER
+
+
+def test_numbers_that_are_none_are_no_zeros_nor_others() -> None:
+    whole = RNG.gamma(1.0, 100.0, (40, 50)).astype(np.float32)
+    whole[3, 7] = whole[8, 9] = 0
+    lacking, elsewhere = whole.copy(), whole.copy()
+    lacking[3, 7], elsewhere[8, 9] = np.nan, np.inf
+    told = {name: marks_of(array) for name, array in (("whole", whole), ("lacking", lacking))}
+    assert likeness([told["lacking"]], [marks_of(lacking)]) is SAME
+    assert likeness([told["lacking"]], [marks_of(whole)]) is OTHER
+    assert likeness([told["whole"]], [marks_of(lacking)]) is OTHER
+    assert likeness([told["lacking"]], [marks_of(elsewhere)]) is OTHER
+    before = {name: told["whole"][name] for name in ("shape", "norm", "marks")}  # of before 2026-12
+    assert likeness([before], [marks_of(whole)]) is NEAR
+    assert likeness([before], [marks_of(lacking)]) is UNKNOWN
