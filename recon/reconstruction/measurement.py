@@ -38,11 +38,15 @@ MOST_LIGHT = 1.5
 
 LINES_FOUND = "shared_lines_counts"
 """Where lines were looked for in the photograph itself: its name among what was found."""
-LINES_SAID = "Whole lines of the photograph"
-"""How the warning of such lines begins."""
 
 MARKED = "Put numbers there, and mark them in erasures."
 """What helps where pixels of a measurement that are NaN are not erased by themselves."""
+
+
+class OfOnePhotograph(str):
+    """A warning of one photograph alone: another's data in the same problem leave it behind."""
+
+    __slots__ = ()
 
 
 @dataclass(frozen=True)

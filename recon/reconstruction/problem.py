@@ -20,9 +20,9 @@ from recon.errors import InputError
 from recon.priors import PRIORS, Prior, TotalVariation
 from recon.reconstruction.measurement import (
     LINES_FOUND,
-    LINES_SAID,
     Floats,
     Measurement,
+    OfOnePhotograph,
     depths_of,
     require_same_channels,
     require_same_pixels,
@@ -206,7 +206,7 @@ class Problem:
         if LINES_FOUND in measurement.found:  # they are noise: of each photograph its own
             found = {name: value for name, value in measurement.found.items() if name != LINES_FOUND}
             measurement = replace(measurement, lines=None, found=found)
-            told = tuple(words for words in told if not words.startswith(LINES_SAID))
+            told = tuple(words for words in told if not isinstance(words, OfOnePhotograph))
         counts = measurement.channels()
         if counts.shape != self.data.shape or measurement.flat != self.flat:
             raise InputError(

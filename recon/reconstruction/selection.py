@@ -28,7 +28,7 @@ from recon.reconstruction.background import (
 )
 from recon.reconstruction.choice import Choice
 from recon.reconstruction.colours import channels_of, merged
-from recon.reconstruction.measurement import LINES_FOUND, LINES_SAID, Measurement
+from recon.reconstruction.measurement import LINES_FOUND, Measurement, OfOnePhotograph
 from recon.reconstruction.options import Overrides, ReconstructionOptions
 from recon.reconstruction.planes import BEYOND, between_of, no_beyond, planes_of, with_planes_beyond
 from recon.reconstruction.probe import COARSE_PX, camera_cost, coarse_copy, coarse_passes, within_of
@@ -147,8 +147,8 @@ def without_shared_lines(problem: Problem) -> Problem:
     )
     counts = measurement.counts()
     deviation = measurement.deviations(counts).astype(np.float32)
-    told = (
-        f"{LINES_SAID} differ from their neighbours: {lines} counts (standard deviation; "
+    told = OfOnePhotograph(
+        f"Whole lines of the photograph differ from their neighbours: {lines} counts (standard deviation; "
         f"a pixel's noise is {float(problem.noise.max()):.3g}), as light through its PSF does not. That was "
         "taken off as far as it can be told from light. As a rule the camera reads whole lines with a noise "
         "of their own: more light, or several frames averaged, make it less. --no-background leaves it."
