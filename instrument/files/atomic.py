@@ -46,10 +46,12 @@ def protecting(inputs: Iterable[Path]) -> Iterator[None]:
 def protect(*inputs: Path) -> None:
     """Add what an input names in its turn (a bench's mask, a plan's images) to the work's inputs.
 
-    Nothing where no work was begun: what is read is then nobody's input.
+    Of an array of a file (``FILE::NAME``) the file. Nothing where no work was begun: what is read is then
+    nobody's input.
     """
     if (before := _inputs.get()) is not None:
-        _inputs.set((*before, *(path for path in inputs if path.exists())))
+        files = (path if path.exists() else Path(str(path).partition("::")[0]) for path in inputs)
+        _inputs.set((*before, *(path for path in files if path.exists())))
 
 
 def refuse_input(path: Path) -> None:
@@ -61,17 +63,30 @@ def refuse_input(path: Path) -> None:
     Raises FileError.
     """
     for held in _inputs.get() or ():
-        if path.exists() and path.samefile(held):
+        if is_same(path, held):
             found = "is an input itself"
-        elif path.is_dir() and held.resolve().is_relative_to(path.resolve()):
+        elif path.is_dir() and _is_within(held, path):
             found = f"holds the input {held}"
-        elif path.exists() and _is_content(held) and path.resolve().is_relative_to(held.resolve()):
+        elif path.exists() and _is_content(held) and _is_within(path, held):
             found = f"is part of the input {held}"
         else:
             continue
         raise FileError(
             path, f"{found}; no output replaces an input, by --force neither.", "Choose another name."
         )
+
+
+def _is_within(path: Path, folder: Path) -> bool:
+    """Whether a path is in a folder or below, as the disk knows it: by another case or mount, too."""
+    return any(is_same(place, folder) for place in path.resolve().parents)
+
+
+def is_same(one: Path, other: Path) -> bool:
+    """Whether two names, links followed, are of one file or folder that is there."""
+    try:
+        return one.samefile(other)
+    except OSError:
+        return False
 
 
 def _is_content(folder: Path) -> bool:

@@ -71,7 +71,7 @@ def made_of(result: StoredResult) -> MadeOf:
     image = _there(_named(told["image"].get("path"), told["image"]), result.path)
     psfs = _there(_named(told["calibration"], told.get(PSF_STACK)), result.path)
     read = (image, psfs, inputs.dark, inputs.erasures)
-    protect(*(Path(str(file).partition("::")[0]) for file in read if isinstance(file, Path)))
+    protect(*(file for file in read if isinstance(file, Path)))
     job = volume_job(psfs, image, inputs)
     pixels, then = told["image"].get("pixels_sha256"), told.get(PREPARED)
     then, now = then if isinstance(then, Mapping) else {}, prepared_record(job)

@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from instrument.files.atomic import check_writable, whole_file, write_json
+from instrument.files.atomic import check_writable, refuse_input, whole_file, write_json
 from instrument.files.errors import BenchError, FileError
 from instrument.files.reading import parse_json, read_bytes
 from instrument.files.record import plain
@@ -141,6 +141,7 @@ class CheckpointFolder:
         self._kept = False
         self.left_aside: tuple[str, ...] = ()
         problem = plain(dict(problem))
+        refuse_input(folder)  # in the end all of it is removed
         if folder.exists() and not folder.is_dir():
             raise FileError(
                 folder, "is a file; a checkpoint is a folder.", "Name another, or one to be made."

@@ -10,6 +10,7 @@ from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
+from instrument.files.atomic import is_same
 from instrument.files.calibration_file import CALIBRATION_FILES, is_calibration
 from instrument.files.errors import FileError
 from instrument.files.reading import parse_json, read_bytes
@@ -205,7 +206,8 @@ def refuse_own_files(path: Path) -> None:
     for folder in path.resolve().parents:
         own = path.resolve().relative_to(folder).parts[0]
         for kind, names in (("run", _RUN_FILES), ("calibration", CALIBRATION_FILES)):
-            if own in names and (is_run(folder) if kind == "run" else is_calibration(folder)):
+            is_own = own in names or any(is_same(folder / own, folder / name) for name in names)
+            if is_own and (is_run(folder) if kind == "run" else is_calibration(folder)):
                 raise FileError(
                     folder,
                     f"is a {kind}, and {own} is part of it; no output replaces it.",

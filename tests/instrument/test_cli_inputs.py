@@ -17,10 +17,11 @@ import typer
 from instrument.bench.config_file import load_config, template
 from instrument.cli import COMMANDS
 from instrument.cli.options import _WORDS, flat
-from instrument.files.atomic import whole_file
+from instrument.files.atomic import refuse_input, whole_file, write_bytes
 from instrument.files.errors import FileError
 from instrument.plan import Part, Plan
 from instrument.plan.model import load_plan
+from instrument.reconstruction.checkpointing import CheckpointFolder
 from instrument.tasks.task import WRITTEN, guarded, part_of
 from instrument.tasks.task import _paths as paths_in
 from recon.base.declare import Option
@@ -181,6 +182,45 @@ def test_what_an_input_names_in_its_turn_is_an_input(tmp_path: Path, monkeypatch
                     pass
         with whole_file("mask.png") as temporary:  # in the window, between two pieces of work
             temporary.write_bytes(b"a mask")
+
+
+def test_a_file_and_a_folder_are_known_by_the_disk_not_by_their_names(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Links that nothing resolves, as a disk has it that knows no case, or one that is mounted twice."""
+    monkeypatch.setattr(Path, "resolve", lambda self, strict=False: self.absolute())
+    psfs, run = tmp_path / "psfs", tmp_path / "run"
+    psfs.mkdir()
+    run.mkdir()
+    for file in (psfs / "a.tif", psfs / "b.tif", run / "state.json", run / "log.jsonl"):
+        file.write_bytes(b"measured")
+    (tmp_path / "PSFS").symlink_to(psfs)
+    (run / "LOG.jsonl").symlink_to(run / "log.jsonl")
+    refused = pytest.raises(FileError, match="no output replaces")
+    for read, output in (
+        (psfs, "PSFS/a.tif"),
+        (psfs / "a.tif", "PSFS/a.tif"),
+        (psfs / "a.tif", "PSFS"),
+        (psfs / "b.tif", "run/LOG.jsonl"),
+        (Path(f"{psfs / 'a.tif'}::psf"), "psfs/a.tif"),
+        (Path(f"{psfs / 'a.tif'}::psf"), "PSFS"),
+    ):
+        with refused, guarded({"psf": read, "out": tmp_path / output}):
+            refuse_input(tmp_path / output)
+    with guarded({"psf": psfs, "out": tmp_path / "PSFS" / "new.tif"}):
+        write_bytes(tmp_path / "PSFS" / "new.tif", b"a result")
+
+
+def test_a_checkpoint_that_an_input_was_put_into_is_not_removed_with_it(tmp_path: Path) -> None:
+    folder = tmp_path / "kept"
+    CheckpointFolder(folder, {"a": 1})
+    (folder / "photo.tif").write_bytes(b"measured")
+    with (
+        pytest.raises(FileError, match="holds the input"),
+        guarded({"image": folder / "photo.tif", "checkpoint": folder}),
+    ):
+        CheckpointFolder(folder, {"a": 1}).remove()
+    assert (folder / "photo.tif").exists()
 
 
 _WRITERS = {
