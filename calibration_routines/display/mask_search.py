@@ -337,10 +337,10 @@ def fit_photographs(
     return found
 
 
-def measure_again(session: AlignmentSession, pose: Pose, pictures: int = 3) -> Measured | None:
+def measure_again(session: AlignmentSession, pose: Pose) -> Measured | None:
     """Measure a pose that spots found by all light around them; None where that does not tell it."""
     rest = np.zeros((*NODES, 2))
-    photograph_sections(session, pose, rest, pictures)
+    photograph_sections(session, pose, rest, 3)
     fitted = fit_photographs(session, pose, rest)
     if fitted is None:
         return None

@@ -133,12 +133,11 @@ class MaskStage:
         """Return the pose's parameters that the axes change, in the axes' units."""
         return {n: getattr(pose, PARAMETERS[n]) * self._units[n] for n in self.axes}
 
-    def test(self, at: Measured, pictures: int = 2) -> tuple[Measured, Pose]:
+    def test(self, at: Measured) -> tuple[Measured, Pose]:
         """Find out which way the axes go by a small move of all of them, and how well the stage comes back.
 
-        Takes so many ``pictures`` for each of the measurements after the moves. Returns where the mask is,
-        back at its place, and by how much that differs from before: repeatability of stage and measurement
-        together.
+        Returns where the mask is, back at its place, and by how much that differs from before: repeatability
+        of stage and measurement together.
 
         Raises AlignmentFailedError when an axis did not do what it was asked for, by all light too.
         """
@@ -150,18 +149,18 @@ class MaskStage:
         session.register()
         # Where the axes go the way of their names the mask is found at once; else from where it was before,
         # which every step leaves within reach.
-        moved = refine_pose(session, self._moved(at.pose, steps), pictures, quick=1, floor=-1)
+        moved = refine_pose(session, self._moved(at.pose, steps), 2, quick=1, floor=-1)
         if moved.efficiency < 0.6 * at.efficiency:
-            moved = refine_pose(session, at.pose, pictures, quick=3)
+            moved = refine_pose(session, at.pose, 2, quick=3)
         if unlike := self._unlike(at, moved, steps):
             session.say(f"{', '.join(unlike)} moved otherwise than asked: measured again")
-            moved = refine_pose(session, moved.pose, 2 * pictures, quick=1)
+            moved = refine_pose(session, moved.pose, 4, quick=1)
             unlike = self._unlike(at, moved, steps)
         # What makes spots wrong is the light around them: that is asked before an axis is named.
         there = measure_again(session, moved.pose) if unlike else None
         self.go(here)
         session.register()
-        back = refine_pose(session, at.pose, pictures + 1, quick=0)
+        back = refine_pose(session, at.pose, 3, quick=0)
         apart = Pose(*(float(v) for v in back.pose.vector() - at.pose.vector()))
         if unlike:
             again = None if there is None else measure_again(session, back.pose)

@@ -43,7 +43,6 @@ def measure_look_up_table(
     io: DisplayBench,
     *,
     n_levels: int = 33,
-    seed: int = 0,
     on_more: Callable[[int, float], object] | None = None,
 ) -> SlmCalibration:
     """Let half of the SLM's pixels interfere with the other half at one level after the other.
@@ -58,7 +57,7 @@ def measure_look_up_table(
     """
     levels = np.unique(np.linspace(0, 255, n_levels).round().astype(int))
     height, width = io.slm.shape
-    chosen = np.random.default_rng(seed).random((height // io.binning, width // io.binning)) < 0.5
+    chosen = np.random.default_rng(0).random((height // io.binning, width // io.binning)) < 0.5
     varied = np.repeat(np.repeat(chosen, io.binning, axis=0), io.binning, axis=1)
     exposure_ms = _exposure_ms(io)
     order: list[int] = []

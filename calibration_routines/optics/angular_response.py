@@ -51,8 +51,8 @@ class Curve:
     seen: tuple[float, ...]
     """Part of the pattern that the sensor still showed."""
 
-    def cut_offs_deg(self, level: float = CUT_OFF) -> tuple[float | None, float | None]:
-        """Return where the response falls to ``level`` on the negative and the positive side; None: nowhere.
+    def cut_offs_deg(self) -> tuple[float | None, float | None]:
+        """Return where the response falls to a fifth on the negative and the positive side; None: nowhere.
 
         Between the measured angles the logarithm goes with the square of the angle.
         """
@@ -62,13 +62,13 @@ class Curve:
             side = np.flatnonzero(sign * angles >= 0)
             order = side[np.argsort(np.abs(angles[side]))]
             a, v = np.abs(angles[order]), values[order]
-            below = np.flatnonzero(v < level)
+            below = np.flatnonzero(v < CUT_OFF)
             if not below.size or below[0] == 0:
                 sides.append(None)
                 continue
             k = int(below[0])
             logs = np.log(np.maximum(v[k - 1 : k + 1], _LEAST))
-            part = (logs[0] - np.log(level)) / (logs[0] - logs[1])
+            part = (logs[0] - np.log(CUT_OFF)) / (logs[0] - logs[1])
             sides.append(float(np.sqrt(a[k - 1] ** 2 + part * (a[k] ** 2 - a[k - 1] ** 2))))
         return sides[0], sides[1]
 

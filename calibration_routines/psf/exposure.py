@@ -3,10 +3,10 @@
 A PSF is the reference that every later photograph is explained with, so a saturated pixel in it is an error
 that no reconstruction can undo. Two rules decide, and the stricter one wins:
 
-* the ``percentile`` (99.9th) of the frame, above the black level, is brought to ``target`` of full scale;
-* the brightest pixel stays at or below ``ceiling`` of full scale. Its margin to full scale covers the photon
-  noise of the frames that follow. Known hot pixels (see :func:`hot_pixels`) are excepted: they saturate
-  without any light and are erased from the reconstruction instead.
+* the :data:`PERCENTILE` of the frame, above the black level, is brought to ``target`` of full scale;
+* the brightest pixel stays at or below :data:`CEILING` of full scale. Its margin to full scale covers the
+  photon noise of the frames that follow. Known hot pixels (see :func:`hot_pixels`) are excepted: they
+  saturate without any light and are erased from the reconstruction instead.
 
 An exposure is returned as reached only after a frame taken with exactly that exposure kept both rules.
 """
@@ -27,6 +27,16 @@ from drivers.led_array import LedPattern
 from instrument.bench.bench import Bench
 
 Counts = npt.NDArray[np.uint8] | npt.NDArray[np.uint16]
+TARGET = 0.7
+"""Fraction of full scale above black that :data:`PERCENTILE` is brought to."""
+TOLERANCE = 0.1
+"""Relative deviation from it that is accepted."""
+PERCENTILE = 99.9
+"""Of a frame's pixels."""
+CEILING = 0.9
+"""Largest fraction of full scale for the brightest pixel."""
+MOST_FRAMES = 20
+"""After which an unsteady source is given up."""
 _DARK = 0.01  # of full scale: below this nothing lights the scene
 _DIMMEST_USABLE = 0.05  # of full scale: below this a PSF drowns in read noise
 
@@ -71,8 +81,6 @@ class AutoExposure:
     outcome: ExposureOutcome
     trace: tuple[ExposureTrial, ...]
     target: float
-    ceiling: float
-    percentile: float
     hot_pixels: int
     """Pixels excepted from both rules because a dark frame showed them as hot."""
 
@@ -94,13 +102,13 @@ class AutoExposure:
         frames = "1 frame" if len(self.trace) == 1 else f"{len(self.trace)} frames"
         found = (
             f"{self.exposure_ms:.4g} ms after {frames}: "
-            f"{self.percentile:g}th percentile at {last.level:.0%} of full scale (target {self.target:.0%}), "
+            f"{PERCENTILE:g}th percentile at {last.level:.0%} of full scale (target {self.target:.0%}), "
             f"brightest pixel at {last.brightest:.0%}"
         )
         advice = {
             ExposureOutcome.REACHED: "",
             ExposureOutcome.HELD_BY_BRIGHTEST_PIXEL: (
-                f" The brightest pixel's ceiling of {self.ceiling:.0%} sets the exposure."
+                f" The brightest pixel's ceiling of {CEILING:.0%} sets the exposure."
             ),
             ExposureOutcome.TOO_DARK: (
                 " This is the camera's longest exposure: raise the source's brightness or the gain, "
@@ -135,15 +143,10 @@ def hot_pixels(dark: Counts, full_scale: int) -> npt.NDArray[np.bool_]:
 def auto_expose(
     camera: Camera,
     *,
-    target: float = 0.7,
-    tolerance: float = 0.1,
-    ceiling: float = 0.9,
-    percentile: float = 99.9,
+    target: float = TARGET,
     hot: npt.NDArray[np.bool_] | None = None,
-    start_ms: float | None = None,
-    max_frames: int = 20,
 ) -> AutoExposure:
-    """Set the camera's exposure for a PSF: ``percentile`` to ``target`` of full scale, nothing saturated.
+    """Set the camera's exposure for a PSF: bright, as ``target`` says, and nothing saturated.
 
     The response of a sensor is linear, so one unsaturated frame with signal predicts the exposure and a
     second one confirms it. A saturated frame says only "shorter": the exposure is halved, then quartered,
@@ -152,52 +155,44 @@ def auto_expose(
     Parameters
     ----------
     camera : Camera
-        Open, with the source on.
-    target, tolerance : float
-        Wanted fraction of full scale above black, and the relative deviation from it that is accepted.
-    ceiling : float
-        Largest fraction of full scale for the brightest pixel.
-    percentile : float
-        Percentile of the frame's pixels that is brought to ``target``.
+        Open, with the source on; the exposure it has is begun with.
+    target : float
+        Wanted fraction of full scale above black, for :data:`PERCENTILE` of the frame's pixels.
     hot : ndarray of bool, optional
         Known hot pixels, in the shape of a frame; excepted from all rules.
-    start_ms : float, optional
-        Exposure to begin with; the present one by default.
-    max_frames : int
-        Frames after which an unsteady source is given up.
 
     Returns
     -------
     AutoExposure
         ``usable`` says whether a PSF can be taken; ``message`` says why not, and what to do.
 
-    Raises ValueError when the fractions make no sense or ``hot`` does not fit the frames.
+    Raises ValueError when the target makes no sense or ``hot`` does not fit the frames.
     """
-    if not 0.0 < target <= ceiling < 1.0:
-        raise ValueError(f"0 < target <= ceiling < 1 must hold, not target={target}, ceiling={ceiling}.")
+    if not 0.0 < target <= CEILING:
+        raise ValueError(f"The target is above 0 and at most {CEILING:g} of full scale, not {target:g}.")
     shortest, longest = camera.exposure_limits_ms
-    exposure = camera.set_exposure_ms(float(np.clip(start_ms or camera.exposure_ms, shortest, longest)))
+    exposure = camera.set_exposure_ms(float(np.clip(camera.exposure_ms, shortest, longest)))
     known_dark, known_saturated = 0.0, float("inf")  # bracket: longest without, shortest with saturation
     saturated_in_a_row = 0
     trace: list[ExposureTrial] = []
 
     def result(outcome: ExposureOutcome) -> AutoExposure:
         n_hot = 0 if hot is None else int(np.count_nonzero(hot))
-        return AutoExposure(exposure, outcome, tuple(trace), target, ceiling, percentile, n_hot)
+        return AutoExposure(exposure, outcome, tuple(trace), target, n_hot)
 
     while True:
-        trial = measure_exposure(camera.snap(), exposure, percentile, hot)
+        trial = measure_exposure(camera.snap(), exposure, hot)
         trace.append(trial)
-        if trial.saturated_pixels or trial.brightest > ceiling:
+        if trial.saturated_pixels or trial.brightest > CEILING:
             if exposure <= shortest * (1 + 1e-6):
                 return result(ExposureOutcome.TOO_BRIGHT)
-        elif abs(trial.level - target) <= tolerance * target:
+        elif abs(trial.level - target) <= TOLERANCE * target:
             return result(ExposureOutcome.REACHED)
-        elif trial.level < target and trial.brightest >= ceiling * (1 - tolerance):
+        elif trial.level < target and trial.brightest >= CEILING * (1 - TOLERANCE):
             return result(ExposureOutcome.HELD_BY_BRIGHTEST_PIXEL)
         elif trial.level < target and exposure >= longest * (1 - 1e-6):
             return result(ExposureOutcome.TOO_DARK)
-        if len(trace) >= max_frames:
+        if len(trace) >= MOST_FRAMES:
             return result(ExposureOutcome.UNSTEADY)
 
         if trial.saturated_pixels:
@@ -209,16 +204,16 @@ def auto_expose(
         else:
             saturated_in_a_row = 0
             known_dark = max(known_dark, exposure)
-            wanted = exposure * _linear_step(trial, target, ceiling, tolerance)
+            wanted = exposure * _linear_step(trial, target)
             if wanted >= known_saturated:
                 wanted = 0.5 * (exposure + known_saturated)
         exposure = camera.set_exposure_ms(float(np.clip(wanted, shortest, longest)))
 
 
 def measure_exposure(
-    frame: Frame, exposure_ms: float, percentile: float, hot: npt.NDArray[np.bool_] | None = None
+    frame: Frame, exposure_ms: float, hot: npt.NDArray[np.bool_] | None = None
 ) -> ExposureTrial:
-    """Judge one frame: its percentile, its brightest pixel and its saturated pixels, hot ones excepted.
+    """Judge a frame: its :data:`PERCENTILE`, brightest pixel and saturated pixels, hot ones excepted.
 
     Raises ValueError when ``hot`` does not have the frame's shape.
     """
@@ -229,7 +224,7 @@ def measure_exposure(
         counts = counts[~hot]
     histogram = np.bincount(counts.ravel(), minlength=frame.full_scale + 1)
     cumulative = np.cumsum(histogram)
-    level = int(np.searchsorted(cumulative, percentile / 100.0 * cumulative[-1]))
+    level = int(np.searchsorted(cumulative, PERCENTILE / 100.0 * cumulative[-1]))
     brightest = int(np.flatnonzero(histogram)[-1])
     black = frame.metadata.black_level
     span = frame.full_scale - black
@@ -241,12 +236,12 @@ def measure_exposure(
     )
 
 
-def _linear_step(trial: ExposureTrial, target: float, ceiling: float, tolerance: float) -> float:
+def _linear_step(trial: ExposureTrial, target: float) -> float:
     """Return the factor on the exposure that a linear sensor needs to keep both rules."""
     if trial.brightest < 0.05:  # so near to black that offsets and read noise decide: go up, but not blindly
-        return min(8.0, 0.5 * ceiling / max(trial.brightest, 1e-3))
+        return min(8.0, 0.5 * CEILING / max(trial.brightest, 1e-3))
     # aim at the middle of the accepted range below the ceiling, so that noise does not undo the step
-    highest = ceiling * (1 - 0.5 * tolerance) / trial.brightest
+    highest = CEILING * (1 - 0.5 * TOLERANCE) / trial.brightest
     return highest if trial.level < 0.01 else min(target / trial.level, highest)
 
 
@@ -255,7 +250,7 @@ def expose_light(
     bench: Bench,
     light_on: Callable[[], object],
     *,
-    target: float = 0.7,
+    target: float = TARGET,
     dimmest: float = 0.0,
     looks: int = 3,
 ) -> AutoExposure:
@@ -285,7 +280,7 @@ def expose_light(
     return found
 
 
-def expose_patterns(bench: Bench, patterns: Sequence[LedPattern], *, target: float = 0.7) -> float:
+def expose_patterns(bench: Bench, patterns: Sequence[LedPattern]) -> float:
     """Find one exposure in ms for all patterns, so that the brightest is exposed as a PSF is; ends dark.
 
     All LEDs together are exposed, then each pattern is photographed once at that: it is dimmer, however dim,
@@ -302,27 +297,27 @@ def expose_patterns(bench: Bench, patterns: Sequence[LedPattern], *, target: flo
         levels[index] = red, green, blue
     together = LedPattern("all patterns", tuple(levels.items()))
     try:
-        found = expose_light(bench, lambda: leds.set_pattern(together), target=target, dimmest=_DARK, looks=1)
+        found = expose_light(bench, lambda: leds.set_pattern(together), dimmest=_DARK, looks=1)
         leds.off()
         dark = camera.snap()
         hot = hot_pixels(dark.image, dark.full_scale)
         factors = []
         for pattern in patterns:
             leds.set_pattern(pattern)
-            trial = measure_exposure(camera.snap(), found.exposure_ms, 99.9, hot)
-            factors.append(_linear_step(trial, target, 0.9, 0.1))
+            trial = measure_exposure(camera.snap(), found.exposure_ms, hot)
+            factors.append(_linear_step(trial, TARGET))
     finally:
         leds.off()
     shortest, longest = camera.exposure_limits_ms
     return float(np.clip(found.exposure_ms * min(factors), shortest, longest))
 
 
-def expose_source(bench: Bench, *, target: float = 0.7) -> AutoExposure:
+def expose_source(bench: Bench, *, target: float = TARGET) -> AutoExposure:
     """Auto-expose the point source where it stands, and leave it lit; errors as :func:`expose_light`."""
     return expose_light(bench, bench.source_on, target=target, dimmest=_DIMMEST_USABLE)
 
 
-def expose_scene(bench: Bench, *, target: float = 0.7) -> AutoExposure:
+def expose_scene(bench: Bench, *, target: float = TARGET) -> AutoExposure:
     """Auto-expose the lit scene as a PSF is, and darken it; errors as :func:`expose_light`.
 
     A scene too dark for ``target`` gets the longest exposure.
