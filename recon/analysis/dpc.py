@@ -62,9 +62,13 @@ class DpcOptics:
             )
 
 
-def phase_from_halves(
-    halves: Mapping[str, npt.ArrayLike], optics: DpcOptics, *, regularisation: float = 0.1
-) -> Image:
+REGULARISATION = 0.1
+"""Weight of the phase's curvature (in units of the aperture) against the data: keeps the finest structure,
+which the pupil hardly passes, from drowning in noise; what is ten times as coarse as the aperture resolves
+loses 0.06 %."""
+
+
+def phase_from_halves(halves: Mapping[str, npt.ArrayLike], optics: DpcOptics) -> Image:
     """Return the phase of a thin sample in radians, float32 (height, width), mean and mean slope zero.
 
     Halves of unequal brightness look like a sample tilted up to its edges: each is brought to its opposite's
@@ -78,10 +82,6 @@ def phase_from_halves(
     halves : mapping of str to array, (height, width)
         ``"left"``, ``"right"``, ``"top"``, ``"bottom"``: lit by the LEDs with negative and positive x, and
         with positive and negative y; dark frame subtracted.
-    regularisation : float
-        Weight of the phase's curvature (in units of the aperture) against the data: keeps the finest
-        structure, which the pupil hardly passes, from drowning in noise; what is ten times as coarse as the
-        aperture resolves loses 0.06 % by default.
     """
     images = {}
     for side in SIDES:
@@ -102,7 +102,7 @@ def phase_from_halves(
     seen = np.conj(transfer_x) * np.fft.fft2(x) + np.conj(transfer_y) * np.fft.fft2(y)
     radius = optics.objective_na / (1e-3 * optics.wavelength_nm)
     qy, qx = (np.fft.fftfreq(n, optics.pitch_um) for n in x.shape)
-    power += regularisation * ((qy[:, None] ** 2 + qx**2) / radius**2) ** 2
+    power += REGULARISATION * ((qy[:, None] ** 2 + qx**2) / radius**2) ** 2
     power[0, 0] = 1.0  # the mean leaves no trace
     phase = np.fft.ifft2(seen / power).real[:height, :width]
     return np.asarray(level(phase), np.float32)

@@ -66,10 +66,8 @@ class Transformation:
         return ", ".join(said) or "as it is"
 
 
-def transformed(
-    psfs: npt.ArrayLike, how: Transformation, *, centre: tuple[float, float] | None = None
-) -> Floats:
-    """Return PSFs (..., height, width) whose pattern is moved, enlarged, turned, mirrored; float32.
+def transformed(psfs: npt.ArrayLike, how: Transformation) -> Floats:
+    """Return PSFs whose pattern is moved, and enlarged, turned, mirrored about the middle; float32.
 
     Every PSF keeps its light, but for what leaves the image; zeros come in. Cubic splines, and where the
     pattern shrinks, a Gaussian first takes out what the new pixels cannot hold; no negative values that were
@@ -80,11 +78,9 @@ def transformed(
     psfs : array, (..., height, width)
         Background removed.
     how : Transformation
-    centre : (float, float), optional
-        ``(row, column)`` of the optical centre; default the image's geometric one.
     """
     images = np.asarray(psfs, np.float32)
-    middle = geometric_centre(images) if centre is None else np.asarray(centre, float)
+    middle = geometric_centre(images)
     back = np.linalg.inv(how.matrix)
     displaced = middle + np.array([how.rows, how.columns])
     return resampled(images, back, middle - back @ displaced) / np.float32(how.scale**2)

@@ -59,12 +59,13 @@ def interpolation_weights(
     return _scattered(p, v, y, x)
 
 
-def grid_axes(points: Floats, tolerance: float = 0.02) -> tuple[Floats, Floats, npt.NDArray[np.intp]] | None:
-    """Return rows, columns and order of points that form a grid, or None where they do not.
+_OFF_LINE = 0.02
+"""How far a point may be off its line, relative to the extent: stages repeat imperfectly."""
 
-    ``tolerance`` is how far a point may be off its line, relative to the extent: stages repeat imperfectly.
-    """
-    lines = [_lines(points[:, axis], tolerance) for axis in (0, 1)]
+
+def grid_axes(points: Floats) -> tuple[Floats, Floats, npt.NDArray[np.intp]] | None:
+    """Return rows, columns and order of points that form a grid, or None where they do not."""
+    lines = [_lines(points[:, axis]) for axis in (0, 1)]
     (y, row), (x, column) = lines
     if len(y) * len(x) != len(points):
         return None
@@ -74,10 +75,10 @@ def grid_axes(points: Floats, tolerance: float = 0.02) -> tuple[Floats, Floats, 
     return y, x, np.argsort(index)
 
 
-def _lines(positions: Floats, tolerance: float) -> tuple[Floats, npt.NDArray[np.intp]]:
+def _lines(positions: Floats) -> tuple[Floats, npt.NDArray[np.intp]]:
     """Cluster positions into lines; return each line's mean and each position's line."""
     order = np.argsort(positions)
-    gaps = np.diff(positions[order]) > tolerance * max(float(np.ptp(positions)), 1e-12)
+    gaps = np.diff(positions[order]) > _OFF_LINE * max(float(np.ptp(positions)), 1e-12)
     label = np.empty(len(positions), np.intp)
     label[order] = np.concatenate([[0], np.cumsum(gaps)])
     means = np.array([positions[label == k].mean() for k in range(label.max() + 1)])
@@ -244,10 +245,10 @@ def _offset(corner: tuple[int, int], field: FieldOfPsfs) -> tuple[int, int]:
     return corner[0] - (height - 1), corner[1] - (width - 1)
 
 
-def cut_to_support(psfs: Array, threshold: float = 1e-6) -> tuple[Array, tuple[int, int]]:
-    """Cut PSFs (..., height, width) to the rectangle that holds all but ``threshold`` of their maximum."""
+def cut_to_support(psfs: Array) -> tuple[Array, tuple[int, int]]:
+    """Cut PSFs (..., height, width) to the rectangle that holds all above a millionth of their maximum."""
     bright = np.abs(psfs).max(axis=tuple(range(psfs.ndim - 2)))
-    used = bright > threshold * float(bright.max())
+    used = bright > 1e-6 * float(bright.max())
     rows, columns = bounding_window(used) if used.any() else (slice(0, 1), slice(0, 1))
     return psfs[..., rows, columns], (rows.start, columns.start)
 

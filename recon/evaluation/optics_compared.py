@@ -210,11 +210,12 @@ def _diffuser(name: str, seed: int) -> Diffuser:
     return Diffuser((heights - heights.mean()).astype(np.float32), _HEIGHTS_UM, size, OPTICAL_EPOXY)
 
 
-def _spokes(n: int = 72, spokes: int = 8) -> npt.NDArray[np.float64]:
-    """Draw bright spokes on black."""
+def _spokes() -> npt.NDArray[np.float64]:
+    """Draw eight bright spokes on black, (72, 72)."""
+    n = 72
     y, x = np.mgrid[:n, :n] - (n - 1) / 2
     radius = np.hypot(y, x) / (n / 2)
-    return np.where((np.sin(spokes * np.arctan2(y, x)) > 0.35) & (radius > 0.2) & (radius < 0.95), 1.0, 0.0)
+    return np.where((np.sin(8 * np.arctan2(y, x)) > 0.35) & (radius > 0.2) & (radius < 0.95), 1.0, 0.0)
 
 
 def _onto_depths(scene: Scene) -> Scene:

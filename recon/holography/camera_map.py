@@ -135,8 +135,8 @@ TURNS_RAD = 0.02 * np.arange(-10, 11)
 """Rotations of the camera that are tried."""
 _CLEAR = 6.0
 """Standard deviations by which the correlation of a block that is recognised stands out."""
-_WIDE = 60
-"""Largest shift of the middle, pixels."""
+_WIDE, _LOCAL = 60, 10
+"""Largest shift of the middle, and of a block once the middle is known, pixels."""
 
 
 def register_camera(
@@ -144,8 +144,6 @@ def register_camera(
     display: Display,
     pixels_across: float,
     *,
-    blocks: int = 9,
-    search: int = 10,
     turned_rad: float | None = None,
 ) -> CameraMap:
     """Find the map from a frame taken with a blank SLM.
@@ -157,10 +155,6 @@ def register_camera(
     display : Display
     pixels_across : float
         Nominal number of camera pixels across the field of view, within about a per cent.
-    blocks : int
-        Along each axis.
-    search : int
-        Largest local shift, pixels.
     turned_rad : float, optional
         How the camera was turned when it was registered last, where that is known; else it is looked for
         (:data:`TURNS_RAD`).
@@ -180,7 +174,7 @@ def register_camera(
     turn = _turn(image, speckle, found, middle) if turned_rad is None else turned_rad
     found = found.turned(turn)
     # The middle first, with a wide search; then outwards with the map found so far.
-    for reach, count, wide, order in ((0.08, 1, _WIDE, 0), (0.25, 5, search, 1), (0.45, blocks, search, 3)):
+    for reach, count, wide, order in ((0.08, 1, _WIDE, 0), (0.25, 5, _LOCAL, 1), (0.45, 9, _LOCAL, 3)):
         places, shifts, weights = [], [], []
         side = middle if count == 1 else 96
         for y in np.linspace(-reach, reach, count) if count > 1 else (0.0,):

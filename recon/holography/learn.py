@@ -84,11 +84,11 @@ class Lesson:
     helps: bool
 
 
-def nothing_learned(display: Display, *, levels: int = 5, orders: tuple[int, int] = (4, 6)) -> Learned:
+def nothing_learned(display: Display) -> Learned:
     """Return what is to be learned of a display before anything is: the display as it is described."""
-    amplitude, phase = (np.zeros(len(terms(order))) for order in orders)
+    amplitude, phase = (np.zeros(len(terms(order))) for order in (4, 6))
     light = display.dc.amplitude
-    response = np.zeros((levels + 1, 2))
+    response = np.zeros((6, 2))
     response[:, 0] = display.dc.modulated
     dc = np.array([light.real, light.imag])
     return Learned(response, dc, np.zeros(2), amplitude, phase, np.zeros((2, 4)), 1.0)

@@ -281,9 +281,9 @@ class HologramModel:
         rows, top = self.band.kept[0], self.band.top
         return np.concatenate([self._spectrum[:top], self._spectrum[len(self._spectrum) - rows + top :]])
 
-    def efficiency(self, slm: ComplexArray, plane: int = 0) -> float:
+    def efficiency(self, slm: ComplexArray) -> float:
         """Return the part of the light on the SLM that reaches the field, DC term and envelope included."""
-        self._intensity_spectrum(self._check(slm), plane)
+        self._intensity_spectrum(self._check(slm), 0)
         passed = 1.0 if self._near is None else self._near.passed
         return float(self._spectrum[0, 0].real) * self._mean_light * passed
 
@@ -291,16 +291,16 @@ class HologramModel:
         """Return the row spectra of ``dL/dI`` of the pattern that was evaluated last, for :meth:`weighed`."""
         return self._spectrum.copy()
 
-    def weighed(self, field: ComplexArray, slope: ComplexArray, plane: int = 0) -> ComplexArray:
-        """Take a field at the SLM, DC light included, to the image plane, weigh it there, and back.
+    def weighed(self, field: ComplexArray, slope: ComplexArray) -> ComplexArray:
+        """Take a field at the SLM, DC light included, to the first image plane, weigh it there, and back.
 
         ``slope``, from :meth:`slope`, is the weight: the result is the gradient by the field, (height,
         width), of the light weighed so; it is linear in the field.
         """
-        self._intensity_spectrum(np.ascontiguousarray(field, self.dtype)[None], plane)
+        self._intensity_spectrum(np.ascontiguousarray(field, self.dtype)[None], 0)
         self._spectrum[:] = slope
         out = np.zeros(self.display.slm_shape, self.dtype)
-        self._backward(0, plane, out)
+        self._backward(0, 0, out)
         return out
 
     def back_propagate(self, amplitude: ComplexArray, plane: int = 0) -> ComplexArray:

@@ -21,7 +21,7 @@ from recon.holography.display import Display
 from recon.holography.learn import Look
 from recon.holography.learned import legendre, terms
 from recon.holography.pose import Pose, nodes_of, on_mask, propagated
-from recon.holography.sections import ORDER, POWERS, SmoothField, likelihood_of, split_field
+from recon.holography.sections import ORDER, POWERS, SmoothField, likelihood, split_field
 from recon.holography.target import ORDER as STEEPNESS
 from recon.holography.target import band_of
 
@@ -80,7 +80,6 @@ def fit_place(
     rest: npt.NDArray[np.float64],
     *,
     tilt_mrad: float = 5.0,
-    likely: float = 1.0,
 ) -> FittedPlace:
     """Fit the mask's place to photographs of known patterns.
 
@@ -95,15 +94,13 @@ def fit_place(
         Displacement beyond the pose's. Together they are right within a quarter of an SLM pixel or so.
     tilt_mrad : float
         Of a mask put in by hand: taken for likely.
-    likely : float
-        As in :func:`recon.holography.sections.fit_field`.
 
     Raises InputError for a single photograph.
     """
     if len(looks) < 2:
         raise InputError(f"The mask's place is told by at least 2 photographs, not {len(looks)}.")
     fit = _Fit(display, pose, rest)
-    curvature = np.diag(likelihood_of(likely))
+    curvature = np.diag(likelihood())
     deep = [0.0, tilt_mrad**-2, tilt_mrad**-2]
     light = np.repeat(np.power(_LIGHT, -2.0), [len(_PHASES), len(_SHADES)])
     tight = np.concatenate([curvature, curvature, deep, np.zeros(_DC), light])

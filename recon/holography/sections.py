@@ -61,11 +61,14 @@ class Sections:
 
 
 POWERS = [(i, n - i) for n in range(ORDER + 1) for i in range(n + 1)]
+LIKELY = 1.0
+"""Size of coefficients of second and third order (mask pixels at the middle of the left and right borders)
+that is expected before anything is measured: keeps a field tame between and beyond the sections."""
 
 
-def likelihood_of(likely: float) -> npt.NDArray[np.float64]:
-    """Return the inverse covariance of the monomials before anything is measured (see :func:`fit_field`)."""
-    return np.diag([0.0 if i + j < 2 else likely**-2 for i, j in POWERS])
+def likelihood() -> npt.NDArray[np.float64]:
+    """Return the inverse covariance of the monomials before anything is measured of a mask."""
+    return np.diag([0.0 if i + j < 2 else LIKELY**-2 for i, j in POWERS])
 
 
 def hypotheses(step: float) -> npt.NDArray[np.float64]:
@@ -184,9 +187,7 @@ class SmoothField:
     misfit: float
 
 
-def fit_field(
-    found: SectionShifts, sections: Sections, mask_shape: tuple[int, int], *, likely: float = 1.0
-) -> SmoothField:
+def fit_field(found: SectionShifts, sections: Sections, mask_shape: tuple[int, int]) -> SmoothField:
     """Fit a smooth field through the sections' shifts.
 
     Parameters
@@ -194,10 +195,6 @@ def fit_field(
     found : SectionShifts
     sections : Sections
     mask_shape : (int, int)
-    likely : float
-        Size of coefficients of second and third order (mask pixels at the middle of the left and right
-        borders) that is expected before anything is measured: keeps the field tame between and beyond the
-        sections.
 
     Raises InputError when fewer than half of the sections were found.
     """
@@ -207,7 +204,6 @@ def fit_field(
             f"Spots of {int(known.sum())} of {len(sections)} sections of the SLM were seen; half are needed."
         )
     basis = sections.basis()[known]
-    likelihood = likelihood_of(likely)
     y, x = nodes_of(mask_shape)
     half_width = mask_shape[1] / 2
     at_nodes = np.stack([(y / half_width) ** i * (x / half_width) ** j for i, j in POWERS])
@@ -215,7 +211,7 @@ def fit_field(
     for axis in range(2):
         weighted = basis / found.error[known, axis, None]
         wanted = found.shift[known, axis] / found.error[known, axis]
-        covariance = np.linalg.inv(weighted.T @ weighted + likelihood)
+        covariance = np.linalg.inv(weighted.T @ weighted + likelihood())
         solution = covariance @ weighted.T @ wanted
         field[..., axis] = np.tensordot(solution, at_nodes, 1)
         chi += float(np.sum((weighted @ solution - wanted) ** 2))

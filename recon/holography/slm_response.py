@@ -113,13 +113,13 @@ def _basis(shape: tuple[int, int]) -> Array:
     return basis
 
 
-def flatness_jacobian(step: float, shape: tuple[int, int] = (48, 64)) -> npt.NDArray[np.float64]:
+def flatness_jacobian(step: float) -> npt.NDArray[np.float64]:
     """Return how ``(a+ - a-) / (a+ + a-)`` of spot pairs answers to an error, per radian, (7, 7).
 
     The pair of mode ``p`` takes off ``+step`` and ``-step`` radians of it; a spot's amplitude is the mean of
     ``exp(j error)`` over the SLM.
     """
-    basis = _basis(shape)
+    basis = _basis((48, 64))
     small = 0.1
     jacobian = np.zeros((len(MODES), len(MODES)))
     for q, error in enumerate(basis):

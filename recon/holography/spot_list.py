@@ -73,13 +73,11 @@ class SpotList:
         return len(self.places)
 
 
-def spot_array(rows: int, columns: int, *, extent: float = 0.6, z_mm: float = 0.0) -> SpotList:
-    """Return an even array about the axis, ``extent`` of the field wide and high."""
-    if rows < 1 or columns < 1 or not 0 < extent <= 1:
-        raise InputError(
-            f"A spot array has rows and columns and an extent in 0 to 1, not {rows} x {columns}, {extent:g}."
-        )
-    y, x = (0.5 + extent * (np.arange(n) - (n - 1) / 2) / max(n - 1, 1) for n in (rows, columns))
+def spot_array(rows: int, columns: int, *, z_mm: float = 0.0) -> SpotList:
+    """Return an even array about the axis, 0.6 of the field wide and high."""
+    if rows < 1 or columns < 1:
+        raise InputError(f"A spot array has rows and columns, not {rows} x {columns}.")
+    y, x = (0.5 + 0.6 * (np.arange(n) - (n - 1) / 2) / max(n - 1, 1) for n in (rows, columns))
     places = np.stack(np.meshgrid(y, x, indexing="ij"), axis=-1).reshape(-1, 2)
     return SpotList(places, np.ones(len(places)), np.full(len(places), float(z_mm)))
 

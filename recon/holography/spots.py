@@ -177,8 +177,6 @@ class SpotMaker:
     ----------
     display : Display
         Its ``displacement`` is not used: poses say where the mask is.
-    threads : int
-        For the Fourier transforms.
 
     Attributes
     ----------
@@ -188,16 +186,15 @@ class SpotMaker:
 
     rest: npt.NDArray[np.float64] | None = None
 
-    def __init__(self, display: Display, *, threads: int = 1) -> None:
+    def __init__(self, display: Display) -> None:
         self.display = display
-        self.threads = threads
         height, width = display.mask.shape
         k = display.factor
         # Two samples per SLM pixel (or one per mask pixel where that is coarser) hold the sinc's main lobe.
         self.fine = 1 if k == 1 else 2
         self.shape = (display.slm_shape[0] * self.fine, display.slm_shape[1] * self.fine)
         mask = display.mask.field(display.wavelength_nm)
-        self._spectrum = scipy.fft.fft2(np.conj(mask).astype(np.complex64), workers=threads)
+        self._spectrum = scipy.fft.fft2(np.conj(mask).astype(np.complex64))
         self._rows, self._columns = (scipy.fft.fftfreq(n, 1 / n).astype(int) for n in self.shape)
         pitch_mm = display.mask_pitch_um * 1e-3
         fy, fx = self._rows / (height * pitch_mm), self._columns / (width * pitch_mm)
@@ -275,7 +272,7 @@ class SpotMaker:
                         ramp_x.astype(np.complex64),
                     )
             total += layer * self._free_space(z_um) if z_um else layer
-        field = scipy.fft.ifft2(total * self._centre, overwrite_x=True, workers=self.threads)
+        field = scipy.fft.ifft2(total * self._centre, overwrite_x=True)
         n = self.fine
         binned = field.reshape(field.shape[0] // n, n, field.shape[1] // n, n).sum(axis=(1, 3))
         slm = np.exp(1j * np.angle(binned)).astype(np.complex64)
@@ -293,16 +290,16 @@ class SpotMaker:
         spectrum *= np.exp(-2j * np.pi * self._columns * (shift[1] / width)).astype(np.complex64)
         if pose.z_um:
             spectrum *= self._free_space(pose.z_um)
-        wave = scipy.fft.ifft2(spectrum, workers=self.threads)
+        wave = scipy.fft.ifft2(spectrum)
         reach = abs(pose.pitch_mrad * self._y_mm[-1]) + abs(pose.yaw_mrad * self._x_mm[-1])  # um at a corner
         if reach > FLAT * depth_um(self.display):
             depth = 1e-3 * (pose.pitch_mrad * self._y_mm[:, None] + pose.yaw_mrad * self._x_mm)
             depth = depth.astype(np.float32)
             # Second order in the depth: the probes tilt by far more than the mask ever is.
             spectrum *= np.complex64(1j) * self._f2
-            wave += depth * scipy.fft.ifft2(spectrum, workers=self.threads)
+            wave += depth * scipy.fft.ifft2(spectrum)
             spectrum *= np.complex64(0.5j) * self._f2
-            wave += depth**2 * scipy.fft.ifft2(spectrum, overwrite_x=True, workers=self.threads)
+            wave += depth**2 * scipy.fft.ifft2(spectrum, overwrite_x=True)
         return np.ascontiguousarray(wave, np.complex64)
 
     def _free_space(self, z_um: float) -> npt.NDArray[np.complex64]:
@@ -337,16 +334,14 @@ def _mean_of(
     return middle
 
 
-def spread_spots(
-    count: int, shape: tuple[int, int], *, reach: float = 0.38, seed: int = 0
-) -> list[tuple[int, int]]:
-    """Return places for spots: integer bins from the axis, a jittered grid inside ``reach`` of the field."""
+def spread_spots(count: int, shape: tuple[int, int], *, seed: int = 0) -> list[tuple[int, int]]:
+    """Return places for spots: integer bins from the axis, a jittered grid inside 0.38 of the field."""
     rng = np.random.default_rng(seed)
     side = int(np.ceil(np.sqrt(count)))
     cells = [(i, j) for i in range(side) for j in range(side)]
     rng.shuffle(cells)
     places = []
     for i, j in cells[:count]:
-        y, x = ((np.array([i, j]) + 0.5 + rng.uniform(-0.15, 0.15, 2)) / side * 2 - 1) * reach
+        y, x = ((np.array([i, j]) + 0.5 + rng.uniform(-0.15, 0.15, 2)) / side * 2 - 1) * 0.38
         places.append((round(y * shape[0]), round(x * shape[1])))
     return places

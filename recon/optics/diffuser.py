@@ -80,7 +80,6 @@ def smooth_diffuser(
     *,
     feature_size_um: float = 140.0,
     mean_slope_deg: float = 0.7,
-    glass: Glass = POLYCARBONATE,
     seed: int = 0,
 ) -> Diffuser:
     """Smooth diffuser: white noise through a Gaussian low-pass (Kuo 2020, 4.3 and A.2).
@@ -115,7 +114,7 @@ def smooth_diffuser(
     heights = heights - heights.mean()
     dy, dx = np.gradient(heights, pitch_um)
     heights *= np.tan(np.deg2rad(mean_slope_deg)) / np.hypot(dy, dx).mean()
-    return Diffuser(np.ascontiguousarray(heights, np.float32), pitch_um, aperture_um, glass)
+    return Diffuser(np.ascontiguousarray(heights, np.float32), pitch_um, aperture_um, POLYCARBONATE)
 
 
 def microlens_diffuser(
@@ -126,7 +125,6 @@ def microlens_diffuser(
     focal_length_um: float = 1500.0,
     regular: bool = False,
     glass: Glass = OPTICAL_EPOXY,
-    ambient: Glass = AIR,
     seed: int = 0,
 ) -> Diffuser:
     """Plano-spherical lenslets without gaps, at random places or on a square lattice (Kuo 2020, 6.3).
@@ -138,7 +136,7 @@ def microlens_diffuser(
     lenslet_um : float
         Mean lenslet diameter: each covers an area of ``lenslet_um^2`` on average.
     focal_length_um : float
-        Focal length in air for light at 589 nm; sets the surfaces' radius ``R = f (n_glass - n_ambient)``.
+        Focal length in air for light at 589 nm; sets the surfaces' radius ``R = f (n_glass - n_air)``.
     regular : bool
         Lenslets on a square lattice of period ``lenslet_um`` instead of random ones.
     """
@@ -153,7 +151,7 @@ def microlens_diffuser(
         centers = np.stack(np.meshgrid(*lattice, indexing="ij"), axis=-1).reshape(-1, 2)
     else:
         centers = _random_centers(rng, extent + 2 * lenslet_um, lenslet_um)
-    radius_um = focal_length_um * (glass.index - ambient.index)
+    radius_um = focal_length_um * (glass.index - AIR.index)
     y = (np.arange(shape[0]) - (shape[0] - 1) / 2) * pitch_um
     x = (np.arange(shape[1]) - (shape[1] - 1) / 2) * pitch_um
     points = np.stack(np.meshgrid(y, x, indexing="ij"), axis=-1).reshape(-1, 2)
@@ -165,7 +163,7 @@ def microlens_diffuser(
         )
     heights = np.sqrt(radius_um**2 - distance**2)
     heights -= heights.mean()
-    return Diffuser(heights.astype(np.float32), pitch_um, aperture_um, glass, ambient)
+    return Diffuser(heights.astype(np.float32), pitch_um, aperture_um, glass, AIR)
 
 
 def _random_centers(

@@ -69,9 +69,7 @@ class PixelGrid:
         return PixelGrid((height * factor, width * factor), self.pitch_um / factor, self.center_um)
 
 
-def overlap_matrix(
-    source_edges: FloatArray, target_edges: FloatArray, dtype: npt.DTypeLike = np.float32
-) -> sparse.csr_array:
+def overlap_matrix(source_edges: FloatArray, target_edges: FloatArray) -> sparse.csr_array:
     """Fraction of every source cell that falls into every target cell, along one axis.
 
     Parameters
@@ -81,7 +79,7 @@ def overlap_matrix(
 
     Returns
     -------
-    csr_array, (m, n)
+    csr_array, float32, (m, n)
         ``overlap_matrix(...) @ v`` moves the content ``v`` of the source cells (energy, not density) into the
         target cells; columns of source cells that lie wholly inside the target sum to 1.
     """
@@ -100,7 +98,7 @@ def overlap_matrix(
     fractions = lengths / np.diff(source_edges)[i]
     from scipy import sparse  # late: importing recon stays light
 
-    return sparse.csr_array((fractions.astype(dtype), (j, i)), shape=(m, n))
+    return sparse.csr_array((fractions.astype(np.float32), (j, i)), shape=(m, n))
 
 
 def resample_energy(

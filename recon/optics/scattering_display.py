@@ -124,15 +124,10 @@ class ScatteringDisplay:
     spec : DisplaySpec
     mask_phase_rad : ndarray, real, (height, width)
         Phase of every mask pixel.
-    threads : int
-        For the Fourier transforms.
     """
 
-    def __init__(
-        self, spec: DisplaySpec, mask_phase_rad: npt.NDArray[np.floating], *, threads: int = 1
-    ) -> None:
+    def __init__(self, spec: DisplaySpec, mask_phase_rad: npt.NDArray[np.floating]) -> None:
         self.spec = spec
-        self.threads = threads
         n = spec.oversampling
         error = spec.wavefront_rad * _wavefront(mask_phase_rad.shape, spec.wavefront_seed)
         mask = np.exp(1j * (np.asarray(mask_phase_rad) + error)).astype(np.complex64)
@@ -210,20 +205,20 @@ class ScatteringDisplay:
         tilted = pose.pitch_mrad != 0 or pose.yaw_mrad != 0
         if pose.z_um == 0 and not tilted:
             return field
-        spectrum = scipy.fft.fft2(field, overwrite_x=True, workers=self.threads)
+        spectrum = scipy.fft.fft2(field, overwrite_x=True)
         down, across = (np.exp(np.complex64(-1j * pose.z_um * 1e-3) * f2) for f2 in self._f2)
         slope = np.empty_like(spectrum) if tilted else None
         _propagate(spectrum, down, across)
         if slope is not None:
             _slope(spectrum, slope, *self._f2)
-        field = scipy.fft.ifft2(spectrum, overwrite_x=True, workers=self.threads)
+        field = scipy.fft.ifft2(spectrum, overwrite_x=True)
         if slope is not None:
             # The tilt moves the mask by some ten micrometres at its border: first order in z is enough.
             height, width = field.shape
             pitch_mm = spec.mask_pitch_um * 1e-3 / spec.oversampling
             y, x = ((np.arange(m, dtype=np.float32) - (m - 1) / 2) * pitch_mm for m in (height, width))
             depth_mm = (1e-3 * (pose.pitch_mrad * y[:, None] + pose.yaw_mrad * x)).astype(np.float32)
-            field += depth_mm * scipy.fft.ifft2(slope, overwrite_x=True, workers=self.threads)
+            field += depth_mm * scipy.fft.ifft2(slope, overwrite_x=True)
         return np.asarray(field, np.complex64)
 
     def _on_sensor(self, field: Complex, mask_roll_mrad: float) -> Image:
@@ -238,12 +233,12 @@ class ScatteringDisplay:
         for axis, cells in ((1, self._coarse[1]), (0, self._coarse[0])):
             side = 2 * scipy.fft.next_fast_len(cells + _BEYOND, real=True)
             at = np.arange(side) - side // 2
-            padded = scipy.fft.fft(far, 2 * n * cells, axis=axis, workers=self.threads)
+            padded = scipy.fft.fft(far, 2 * n * cells, axis=axis)
             far = padded.take(at % (2 * n * cells), axis=axis)
             kept.append(np.sinc(at / (2 * n * cells)).astype(np.complex64))  # the sampled cells' own envelope
         _propagate(far, kept[1], kept[0])
         light = far.real**2 + far.imag**2
-        spectrum = scipy.fft.rfft2(light, overwrite_x=True, workers=self.threads)
+        spectrum = scipy.fft.rfft2(light, overwrite_x=True)
         pixel = spec.sensor_pitch_um / spec.field_um
         source = spec.source_mrad * spec.focal_mm / spec.field_um
         lags = scipy.fft.fftfreq(light.shape[0]), scipy.fft.rfftfreq(light.shape[1])
@@ -257,7 +252,7 @@ class ScatteringDisplay:
         half, fine = light.shape[0] // 2, (light.shape[0] * 3 // 2, light.shape[1] * 3 // 2)
         padded = np.zeros((fine[0], spectrum.shape[1]), np.complex64)
         padded[:half], padded[-half:] = spectrum[:half], spectrum[half:]
-        light = scipy.fft.irfft2(padded, fine, overwrite_x=True, workers=self.threads)
+        light = scipy.fft.irfft2(padded, fine, overwrite_x=True)
         light *= np.float32(2.25 / (n**4 * self._coarse[0] * self._coarse[1]))
         sensor = np.empty(spec.sensor_shape, np.float32)
         _read(

@@ -366,15 +366,11 @@ def bar_target(pixels: int = 512) -> Image:
     return image
 
 
-def tilted_target(
-    image: npt.ArrayLike,
-    z_um: float,
-    width_um: float,
-    tilt_deg: float,
-    *,
-    slices: int = 32,
-    name: str = "tilted bar target",
-) -> Scene:
+_STRIPS = 32
+"""Of a tilted target: so narrow that the step between two is below the camera's axial resolution."""
+
+
+def tilted_target(image: npt.ArrayLike, z_um: float, width_um: float, tilt_deg: float) -> Scene:
     """Tilt a flat grey target about its vertical axis, as a staircase of strips parallel to the sensor.
 
     Parameters
@@ -386,15 +382,13 @@ def tilted_target(
         Width of the target in its own plane.
     tilt_deg : float
         Positive: the right side (larger x) is farther away.
-    slices : int
-        Strips; choose them so narrow that the step between two is below the camera's axial resolution.
     """
     grey = np.asarray(image, np.float32)
     columns = grey.shape[1]
     tilt = np.deg2rad(tilt_deg)
     pitch = width_um / columns
     height_um = pitch * grey.shape[0]
-    borders = np.linspace(0, columns, min(slices, columns) + 1).round().astype(int)
+    borders = np.linspace(0, columns, min(_STRIPS, columns) + 1).round().astype(int)
     layers = []
     for first, last in itertools.pairwise(borders.tolist()):
         along = ((first + last) / 2 - columns / 2) * pitch
@@ -402,7 +396,7 @@ def tilted_target(
         width = (last - first) * pitch * np.cos(tilt)
         place = (float(along * np.cos(tilt)), 0.0)
         layers.append(Layer(radiance, float(z_um + along * np.sin(tilt)), (height_um, float(width)), place))
-    return Scene(name, layers=tuple(layers))
+    return Scene("tilted bar target", layers=tuple(layers))
 
 
 def _fill(image: Image, left: float, right: float, top: float, bottom: float) -> None:

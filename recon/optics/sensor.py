@@ -119,7 +119,6 @@ def expose(
     exposure_s: float,
     readout: Readout,
     seed: int,
-    out: npt.NDArray[np.uint16] | None = None,
 ) -> npt.NDArray[np.uint16]:
     """Take one exposure.
 
@@ -133,10 +132,8 @@ def expose(
     readout : Readout
     seed : int
         Draws of the temporal noise; another seed, another frame.
-    out : ndarray, uint16, optional
-        Where to put the counts.
     """
-    counts = np.empty(electrons_per_s.shape, np.uint16) if out is None else out
+    counts = np.empty(electrons_per_s.shape, np.uint16)
 
     def rows(start: int, stop: int) -> None:
         expose_pixels(

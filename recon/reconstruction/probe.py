@@ -154,8 +154,8 @@ def psf_window(depths: Depths) -> tuple[int, int]:
     return sizes[0], sizes[1]
 
 
-def acceptance_px(depths: Depths, level: float = ACCEPTED) -> float | None:
-    """Distance from the axis, pixels, at which PSFs are down to ``level`` of the central one's light.
+def acceptance_px(depths: Depths) -> float | None:
+    """Distance from the axis, pixels, at which PSFs are down to :data:`ACCEPTED` of the central one's light.
 
     From a Gaussian fitted to the light of the registered PSFs at the places they were calibrated at; None
     where they do not fall off within reach.
@@ -173,4 +173,4 @@ def acceptance_px(depths: Depths, level: float = ACCEPTED) -> float | None:
     slope = float(r2 @ fall) / float(r2 @ r2)
     if slope <= 0:
         return None
-    return float(np.sqrt(-np.log(level) / slope))
+    return float(np.sqrt(-np.log(ACCEPTED) / slope))
