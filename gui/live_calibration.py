@@ -8,9 +8,8 @@ from pathlib import Path
 import numpy as np
 
 from instrument.bench.kept import KeptWithBench
-from instrument.files.calibration_file import is_calibration, newest_calibration
+from instrument.files.calibration_file import find_calibration, is_calibration, newest_calibration
 from instrument.files.errors import BenchError
-from instrument.reconstruction.job import find_calibration
 from recon.camera.camera_model import members_of_depths
 from recon.types import Calibration
 

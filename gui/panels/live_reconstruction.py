@@ -28,11 +28,10 @@ from gui.widgets.entry import NumberEdit
 from gui.widgets.image_view import ImageView
 from gui.widgets.orientation import OrientationButton, follow_orientation
 from instrument.bench.photograph import SPOILT
-from instrument.files.calibration_file import load_calibration
+from instrument.files.calibration_file import find_calibration, load_calibration
 from instrument.files.errors import BenchError, count, duration, percent
 from instrument.live.light_log import NOTHING_LIT
 from instrument.live.live import LiveResult
-from instrument.reconstruction.job import find_calibration
 from recon.base.declare import Imports, expression, options_of
 from recon.reconstruction.options import ReconstructionOptions
 from recon.reconstruction.result import Reconstruction

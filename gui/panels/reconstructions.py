@@ -36,10 +36,9 @@ from gui.widgets.building import Hint, button, fill, hint, in_row, label, split
 from gui.widgets.dialogues import choose_path
 from gui.widgets.result_views import ConvergenceView, FactsView, PictureView
 from gui.widgets.volume_view import VolumeView
-from instrument.files.calibration_file import calibrated_depths_um, newest_calibration
+from instrument.files.calibration_file import calibrated_depths_um, find_calibration, newest_calibration
 from instrument.files.errors import BenchError, FileError
 from instrument.files.results import find_results
-from instrument.reconstruction.job import find_calibration
 from instrument.reconstruction.request import VolumeRequest
 from instrument.reconstruction.stored_result import StoredResult, open_result
 from recon.base.declare import Imports, expression, options_of

@@ -37,6 +37,10 @@ _PSFS = "psfs.ome.zarr"
 _BACKGROUND = "background.ome.zarr"
 CALIBRATION_FILES = (_JSON, _PSFS, _BACKGROUND)
 _RESTORE = "Take the calibration again or restore it from a copy."
+_PLAIN_PSFS = (
+    "PSF images by themselves tell no places: reconstruct takes one by --psf FILE, one a depth by "
+    "--volume FOLDER."
+)
 _FIELDS = ("shape", "source_positions_um", "geometry", "quality", "provenance", "sha256")
 
 
@@ -113,6 +117,36 @@ def load_calibration(folder: Path | str) -> Calibration:
 def is_calibration(folder: Path | str) -> bool:
     """Whether ``folder`` looks like a calibration (it holds a calibration.json)."""
     return (Path(folder) / _JSON).is_file()
+
+
+def find_calibration(folder: Path) -> Path:
+    """Return the calibration folder that ``folder`` is, or the one that it holds.
+
+    Raises FileError when there is none, or more than one.
+    """
+    if not folder.is_dir():
+        found = "is no folder" if folder.exists() else "does not exist"
+        raise FileError(
+            folder,
+            f"{found}; a calibration or a run folder is expected.",
+            "" if folder.is_dir() or not folder.exists() else _PLAIN_PSFS,
+        )
+    if is_calibration(folder):
+        return folder
+    # In the folder, in a run in it, or in that run's calibration folder (a demo's).
+    patterns = ("*/calibration.json", "*/*/calibration.json")
+    inside = sorted(path.parent for pattern in patterns for path in folder.glob(pattern))
+    if len(inside) != 1:
+        found = (
+            f"{len(inside)} calibrations ({', '.join(p.name for p in inside)})"
+            if inside
+            else "no calibration"
+        )
+        plain = not inside and any(
+            f.suffix.lower() in (".tif", ".tiff", ".png", ".npy") for f in folder.iterdir()
+        )
+        raise FileError(folder, f"holds {found}; exactly one is expected.", _PLAIN_PSFS if plain else "")
+    return inside[0]
 
 
 def calibrated_depths_um(folder: Path | str) -> tuple[float, ...]:

@@ -16,8 +16,7 @@ import numpy as np
 from drivers.common.stream import FrameStream
 from drivers.frame import Frame, FrameMetadata
 from instrument.bench.bench import Bench
-from instrument.files.calibration_file import load_calibration
-from instrument.reconstruction.job import find_calibration
+from instrument.files.calibration_file import find_calibration, load_calibration
 from recon.reconstruction.options import ReconstructionOptions
 from recon.streams.live import LiveReconstructor
 from recon.streams.live_picture import LiveOptions, LivePicture

@@ -15,7 +15,7 @@ from instrument.bench.bench import Bench, open_bench
 from instrument.bench.config import BenchConfig
 from instrument.bench.config_file import TEMPLATES, load_config, parse_config, template
 from instrument.bench.source_and_scene import Ask
-from instrument.files.calibration_file import is_calibration, load_calibration
+from instrument.files.calibration_file import find_calibration, is_calibration, load_calibration
 from instrument.files.errors import BenchError
 from instrument.notebook.asked import FACTS, Asked, Image, Psf, recording_of
 from instrument.notebook.of_runs import PATTERNED, forecast_of_run
@@ -23,7 +23,6 @@ from instrument.notebook.result import Result
 from instrument.notebook.words import speaking
 from instrument.reconstruction import forecast as by_its_beginning
 from instrument.reconstruction.forecast import Forecast
-from instrument.reconstruction.job import find_calibration
 from instrument.reconstruction.options import InputOptions, VideoOptions
 from instrument.runs.run import Run
 from instrument.runs.run_files import is_run

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from instrument.files.calibration_file import is_calibration, load_calibration
+from instrument.files.calibration_file import find_calibration, load_calibration
 from instrument.files.errors import BenchError, FileError, percent
 from instrument.files.images import ImageFile, read_image
 from instrument.reconstruction.defects import mended_psf
@@ -290,40 +290,6 @@ OF_A_FILM = (
     "Frames of a film become a recording by diffuserbench import FILE, and it a video by diffuserbench "
     "reconstruct RUN --video."
 )
-_PLAIN_PSFS = (
-    "PSF images by themselves tell no places: reconstruct takes one by --psf FILE, one a depth by "
-    "--volume FOLDER."
-)
-
-
-def find_calibration(folder: Path) -> Path:
-    """Return the calibration folder that ``folder`` is, or the one that it holds.
-
-    Raises FileError when there is none, or more than one.
-    """
-    if not folder.is_dir():
-        found = "is no folder" if folder.exists() else "does not exist"
-        raise FileError(
-            folder,
-            f"{found}; a calibration or a run folder is expected.",
-            "" if folder.is_dir() or not folder.exists() else _PLAIN_PSFS,
-        )
-    if is_calibration(folder):
-        return folder
-    # In the folder, in a run in it, or in that run's calibration folder (a demo's).
-    patterns = ("*/calibration.json", "*/*/calibration.json")
-    inside = sorted(path.parent for pattern in patterns for path in folder.glob(pattern))
-    if len(inside) != 1:
-        found = (
-            f"{len(inside)} calibrations ({', '.join(p.name for p in inside)})"
-            if inside
-            else "no calibration"
-        )
-        plain = not inside and any(
-            f.suffix.lower() in (".tif", ".tiff", ".png", ".npy") for f in folder.iterdir()
-        )
-        raise FileError(folder, f"holds {found}; exactly one is expected.", _PLAIN_PSFS if plain else "")
-    return inside[0]
 
 
 def matching_binning(image: ImageFile, shape: tuple[int, ...], folder: Path) -> int:

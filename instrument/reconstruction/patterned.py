@@ -14,12 +14,12 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from instrument.files.calibration_file import load_calibration
+from instrument.files.calibration_file import find_calibration, load_calibration
 from instrument.files.errors import BenchError, FileError, count
 from instrument.files.images import ImageFile
 from instrument.plan.illumination import DARK, PATTERN
 from instrument.reconstruction.forecast import Forecast, forecast
-from instrument.reconstruction.job import Job, find_calibration, job_with, matching_binning
+from instrument.reconstruction.job import Job, job_with, matching_binning
 from instrument.reconstruction.mosaic import pattern_of
 from instrument.reconstruction.options import InputOptions
 from instrument.reconstruction.request import refocused

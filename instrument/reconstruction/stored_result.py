@@ -14,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from instrument.files.atomic import protect, refuse_input, whole_file
-from instrument.files.calibration_file import load_calibration, save_calibration
+from instrument.files.calibration_file import find_calibration, load_calibration, save_calibration
 from instrument.files.decoding import require_npy
 from instrument.files.errors import FileError, size
 from instrument.files.images import read_image, write_image
@@ -24,7 +24,6 @@ from instrument.files.reading import parse_json, read_bytes, require_file
 from instrument.files.record import of_kind
 from instrument.files.seen import as_seen
 from instrument.files.tiff_pages import open_tiff
-from instrument.reconstruction.job import find_calibration
 from instrument.volumes.grid_facts import grid_of
 from instrument.volumes.opening import open_volume
 from instrument.volumes.source import VolumeSource, metric_source

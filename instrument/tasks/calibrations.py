@@ -104,10 +104,9 @@ def analyze(
     from calibration_routines.optics.angular_response import load_response
     from instrument.evaluation.analysis_figure import draw_analysis, facts
     from instrument.files.atomic import write_json
-    from instrument.files.calibration_file import load_calibration
+    from instrument.files.calibration_file import find_calibration, load_calibration
     from instrument.files.figures import save_figure
     from instrument.files.record import plain
-    from instrument.reconstruction.job import find_calibration
     from recon.analysis import analyse
     from recon.evaluation.points_in_volumes import in_volumes
     from recon.evaluation.two_points import reached
@@ -185,9 +184,8 @@ def compare(desk: Desk, options: CompareOptions) -> Done:
     Ends with status 1 when a recalibration is due (the new calibration should replace the old one), else 0.
     """
     from instrument.files.atomic import write_json
-    from instrument.files.calibration_file import load_calibration
+    from instrument.files.calibration_file import find_calibration, load_calibration
     from instrument.files.record import plain
-    from instrument.reconstruction.job import find_calibration
     from recon.analysis.compare import compare as compare_calibrations
 
     out, page = options.out, options.figure
@@ -273,8 +271,7 @@ def refocus(desk: Desk, options: RefocusOptions, given: Given) -> Done:
     import numpy as np
 
     from calibration_routines.optics.angular_response import load_response
-    from instrument.files.calibration_file import load_calibration, save_calibration
-    from instrument.reconstruction.job import find_calibration
+    from instrument.files.calibration_file import find_calibration, load_calibration, save_calibration
     from recon.camera.refocus import refocus as refocused
     from recon.camera.refocus_field import extrapolations, refocus_field
     from recon.camera.two_part import is_cut, two_part

@@ -10,11 +10,11 @@ import numpy.typing as npt
 import pytest
 from scipy.ndimage import gaussian_filter
 
-from instrument.files.calibration_file import save_calibration
+from instrument.files.calibration_file import find_calibration, save_calibration
 from instrument.files.errors import BenchError, FileError
 from instrument.files.images import ImageFile, write_image
 from instrument.reconstruction.defects import defective_pixels, mended_psf, mended_stack
-from instrument.reconstruction.job import find_calibration, job_from_calibration, job_from_files
+from instrument.reconstruction.job import job_from_calibration, job_from_files
 from instrument.reconstruction.matching import check_pair
 from instrument.reconstruction.options import InputOptions
 from instrument.reconstruction.preparation import (
