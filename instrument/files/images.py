@@ -26,18 +26,14 @@ from instrument.files.errors import BenchError, FileError
 from instrument.files.image_folders import images_in, in_order, order_in_words
 from instrument.files.named_arrays import is_zarr, read_zarr, zarr_facts
 from instrument.files.ome_tiff import (
-    MICROMETRES,
-    MOST_PLANES,
-    SECONDS,
     depths_in_words,
-    depths_um,
     facts_of,
     film_facts,
-    imagej_time_unit,
     is_ome_name,
-    ome_tiff_channels,
-    photograph_fields,
     resolution,
+    tiff_depths,
+    tiff_times,
+    write_ome_tiff,
 )
 from instrument.files.pictures import ALPHA, READABLE
 from instrument.files.seen import as_seen, levels_of, png_bytes
@@ -205,7 +201,7 @@ def write_image(path: Path | str, image: npt.NDArray[Any], metadata: Mapping[str
         elif suffix == ".png":
             _write_png(temporary, image)
         elif is_ome_name(path) and image.ndim < 4:
-            _write_ome_tiff(temporary, image, metadata or {})
+            write_ome_tiff(temporary, image, metadata or {})
         else:
             _write_tiff(temporary, image, text, (metadata or {}).get("pixel_pitch_um"))
     if text is not None and suffix in (".png", ".npy"):
@@ -244,10 +240,10 @@ def image_metadata(path: Path) -> dict[str, Any]:
                 pattern = bytes(page.tags.valueof(_CFA_PATTERN, b""))
                 if len(pattern) == 4 and max(pattern) < 3:
                     said = {"pixel_format": "Bayer" + "".join(_COLOURS[c] for c in pattern[:2])}
-                said |= _depths(tiff)
+                said |= tiff_depths(tiff)
                 if tiff.is_ome:
                     return said | film_facts(page.description) | facts_of(page.description)
-                said |= _times(tiff)
+                said |= tiff_times(tiff)
                 text = (tiff.imagej_metadata or {}).get("Info") or page.description
         else:
             protect(side_car(path))
@@ -256,27 +252,6 @@ def image_metadata(path: Path) -> dict[str, Any]:
     except (OSError, ValueError, TypeError, FileError, tifffile.TiffFileError):
         return said  # another program's description, or none: the pixels were read all the same
     return {**said, **metadata} if isinstance(metadata, dict) else said
-
-
-def _depths(tiff: tifffile.TiffFile) -> dict[str, Any]:
-    """Return where the planes of a stack lie, as OME or ImageJ tell it; micrometres."""
-    if tiff.ome_metadata is not None:
-        told = depths_um(tiff.ome_metadata)
-    else:
-        stack = tiff.imagej_metadata or {}
-        unit, step = MICROMETRES.get(str(stack.get("unit", "?"))), stack.get("spacing")
-        count = min(int(stack.get("slices", 0)), MOST_PLANES)
-        told = [unit * float(step) * z for z in range(count)] if unit and step else []
-    return {"depths_um": told} if told else {}
-
-
-def _times(tiff: tifffile.TiffFile) -> dict[str, float]:
-    """Return the time from frame to frame of ImageJ's stacks."""
-    stack = tiff.imagej_metadata or {}
-    unit = SECONDS.get(imagej_time_unit(tiff), 0.0)
-    period_s, fps = unit * float(stack.get("finterval", 0)), float(stack.get("fps", 0))
-    period_s = period_s or (1 / fps if fps > 0 else 0.0)
-    return {"frame_period_s": period_s} if stack.get("frames", 0) > 1 and period_s > 0 else {}
 
 
 # Folders -----------------------------------------------------------------------------------------
@@ -457,25 +432,6 @@ def _refuse_non_finite(path: Path, array: npt.NDArray[Any], *, holes: bool) -> N
 
 
 _BIG_TIFF_BYTES = 3_900_000_000
-
-
-def _write_ome_tiff(path: Path, image: npt.NDArray[Any], facts: Mapping[str, Any]) -> None:
-    """Write an OME-TIFF of an image or stack; floats in colour channel by channel: few know RGB of them."""
-    colour = image.ndim == 3 and image.shape[-1] == 3
-    if split := colour and image.dtype.kind == "f":
-        image = np.moveaxis(image, -1, 0)
-    fields: dict[str, Any] = {"axes": "CYX" if split else "YXS" if colour else "ZYX"[3 - image.ndim :]}
-    fields |= photograph_fields(facts, 3 if split else 1 if image.ndim == 2 or colour else len(image))
-    if split:
-        fields["Channel"] = ome_tiff_channels()
-    tifffile.imwrite(
-        path,
-        np.ascontiguousarray(image),
-        ome=True,
-        photometric="rgb" if colour and not split else "minisblack",
-        metadata=fields,
-        **resolution(facts.get("pixel_pitch_um")),
-    )
 
 
 def _write_tiff(path: Path, image: npt.NDArray[Any], text: str | None, pitch_um: float | None) -> None:

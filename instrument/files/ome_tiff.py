@@ -1,4 +1,4 @@
-"""What OME-TIFF says of an image beside its pixels: the format's own fields, and the rest by name.
+"""What TIFFs say of images beside their pixels: OME's fields and the rest by name, and ImageJ's.
 
 Facts for which OME has no field stand in a map annotation of the namespace ``diffuserbench``, each as JSON.
 """
@@ -129,6 +129,27 @@ def resolution(pitch_um: float | None) -> dict[str, Any]:
     return {"resolution": (1e4 / pitch_um, 1e4 / pitch_um), "resolutionunit": "CENTIMETER"}
 
 
+def write_ome_tiff(path: Path, image: npt.NDArray[Any], facts: Mapping[str, Any]) -> None:
+    """Write an OME-TIFF of an image or stack; floats in colour channel by channel: few know RGB of them."""
+    import tifffile
+
+    colour = image.ndim == 3 and image.shape[-1] == 3
+    if split := colour and image.dtype.kind == "f":
+        image = np.moveaxis(image, -1, 0)
+    fields: dict[str, Any] = {"axes": "CYX" if split else "YXS" if colour else "ZYX"[3 - image.ndim :]}
+    fields |= photograph_fields(facts, 3 if split else 1 if image.ndim == 2 or colour else len(image))
+    if split:
+        fields["Channel"] = ome_tiff_channels()
+    tifffile.imwrite(
+        path,
+        np.ascontiguousarray(image),
+        ome=True,
+        photometric="rgb" if colour and not split else "minisblack",
+        metadata=fields,
+        **resolution(facts.get("pixel_pitch_um")),
+    )
+
+
 def depths_um(description: str) -> list[float]:
     """Return where an OME-TIFF says its planes are along z, in their order; empty where it does not.
 
@@ -148,6 +169,30 @@ def depths_um(description: str) -> list[float]:
         return [places[z] for z in range(n_z)]
     unit, step = MICROMETRES.get(pixels.get("PhysicalSizeZUnit", "")), pixels.get("PhysicalSizeZ")
     return [] if unit is None or step is None else [unit * float(step) * z for z in range(n_z)]
+
+
+def tiff_depths(tiff: tifffile.TiffFile) -> dict[str, Any]:
+    """Return where the planes of a stack lie, as OME or ImageJ tell it; micrometres.
+
+    Raises ValueError when its description is no XML.
+    """
+    if tiff.ome_metadata is not None:
+        told = depths_um(tiff.ome_metadata)
+    else:
+        stack = tiff.imagej_metadata or {}
+        unit, step = MICROMETRES.get(str(stack.get("unit", "?"))), stack.get("spacing")
+        count = min(int(stack.get("slices", 0)), MOST_PLANES)
+        told = [unit * float(step) * z for z in range(count)] if unit and step else []
+    return {"depths_um": told} if told else {}
+
+
+def tiff_times(tiff: tifffile.TiffFile) -> dict[str, float]:
+    """Return the time from frame to frame of ImageJ's stacks."""
+    stack = tiff.imagej_metadata or {}
+    unit = SECONDS.get(imagej_time_unit(tiff), 0.0)
+    period_s, fps = unit * float(stack.get("finterval", 0)), float(stack.get("fps", 0))
+    period_s = period_s or (1 / fps if fps > 0 else 0.0)
+    return {"frame_period_s": period_s} if stack.get("frames", 0) > 1 and period_s > 0 else {}
 
 
 def film_facts(description: str) -> dict[str, float]:
