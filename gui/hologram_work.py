@@ -39,7 +39,8 @@ from instrument.files.results import free_result
 from instrument.files.slm_image import load_slm_correction
 from instrument.reconstruction.forecast import Forecast
 from instrument.runs.run_control import EndedEarlyError, RunControl
-from recon.base.declare import Imports, expression, option
+from recon.base.as_python import Imports, expression
+from recon.base.declare import option
 from recon.holography import Display, HologramOptions, HologramRecord, Target
 
 _FRAME_S = 0.02

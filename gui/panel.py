@@ -21,7 +21,7 @@ from gui.widgets.entry import Refusing
 from gui.words import in_the_window
 from instrument.bench.config import Kind
 from instrument.files.errors import BenchError
-from recon.base.declare import Imports
+from recon.base.as_python import Imports
 from recon.errors import InputError
 
 _REFUSAL_MS = 12_000

@@ -30,7 +30,7 @@ from instrument.plan import Plan
 from instrument.plan.model import plan_toml
 from instrument.runs.run_control import EndedEarlyError, RunControl
 from instrument.runs.runner import RunState, RunStatus
-from recon.base.declare import Imports, expression
+from recon.base.as_python import Imports, expression
 
 _LOOK_MS = 100
 

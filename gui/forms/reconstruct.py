@@ -28,7 +28,8 @@ from instrument.reconstruction.request import (
     request_of,
 )
 from instrument.reconstruction.result_file import Outputs, write_reconstruction, write_volume
-from recon.base.declare import Imports, expression, option, options_of
+from recon.base.as_python import Imports, expression
+from recon.base.declare import option, options_of
 from recon.priors import PRIORS
 from recon.reconstruction.choice import Decision
 from recon.reconstruction.options import ReconstructionOptions

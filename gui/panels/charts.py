@@ -25,7 +25,7 @@ from gui.widgets.stability_view import StabilityView
 from instrument.evaluation.chart import ChartData, read_chart, subject_of
 from instrument.files.errors import FileError
 from instrument.files.stability_file import read_stability
-from recon.base.declare import Imports, expression
+from recon.base.as_python import Imports, expression
 from recon.evaluation.scored import KINDS, Axis, Point, is_known, pareto
 from recon.verdict.cases import SHIPPED
 

@@ -36,7 +36,7 @@ from gui.widgets.measure import Measure
 from gui.widgets.orientation import orientation_of
 from gui.widgets.plots import LevelsBar, curve_colour, curve_pen, plot_widget
 from instrument.reconstruction.film import Film, curves, relative, slowed, write_film
-from recon.base.declare import Imports, expression
+from recon.base.as_python import Imports, expression
 
 _FASTEST_MS = 20
 _REST_MS = 250

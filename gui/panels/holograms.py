@@ -37,7 +37,8 @@ from instrument.display.hologram import field_picture, field_words, square
 from instrument.files.errors import BenchError
 from instrument.files.images import read_image
 from instrument.reconstruction.forecast import Forecast
-from recon.base.declare import expression, option, options_of
+from recon.base.as_python import expression
+from recon.base.declare import option, options_of
 from recon.errors import InputError
 from recon.holography import LOSSES, HologramOptions
 from recon.holography.display import require_defocus

@@ -19,7 +19,8 @@ from gui.widgets.dialogues import elided
 from gui.widgets.entry import NumberEdit
 from gui.widgets.plots import plot_widget
 from instrument.plan.patterns import shape_buttons
-from recon.base.declare import Imports, expression, options_of, with_overrides
+from recon.base.as_python import Imports, expression
+from recon.base.declare import options_of, with_overrides
 
 _REST_MS = 150
 """Rest of the brightness before it is sent: a slider that is pulled must not fill a queue."""

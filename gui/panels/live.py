@@ -31,7 +31,7 @@ from instrument.bench.photograph_file import (
 from instrument.files.errors import duration
 from instrument.live.frame_view import sensor_roi
 from instrument.live.live_camera import LiveCameraStatus
-from recon.base.declare import Imports, expression
+from recon.base.as_python import Imports, expression
 
 _LOOK_MS = 8
 """Between two looks whether there is another frame: a look costs next to nothing."""

@@ -32,7 +32,8 @@ from instrument.files.calibration_file import find_calibration, load_calibration
 from instrument.files.errors import BenchError, count, duration, percent
 from instrument.live.light_log import NOTHING_LIT
 from instrument.live.live import LiveResult
-from recon.base.declare import Imports, expression, options_of
+from recon.base.as_python import Imports, expression
+from recon.base.declare import options_of
 from recon.reconstruction.options import ReconstructionOptions
 from recon.reconstruction.result import Reconstruction
 from recon.reconstruction.solve import ITERATIONS

@@ -41,7 +41,8 @@ from instrument.files.errors import BenchError, FileError
 from instrument.files.results import find_results
 from instrument.reconstruction.request import VolumeRequest
 from instrument.reconstruction.stored_result import StoredResult, open_result
-from recon.base.declare import Imports, expression, options_of
+from recon.base.as_python import Imports, expression
+from recon.base.declare import options_of
 from recon.reconstruction.options import ReconstructionOptions
 
 _NOTHING_OPEN = "Nothing is open: choose a result on the left, or reconstruct a photograph."

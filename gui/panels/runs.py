@@ -34,7 +34,7 @@ from instrument.bench.photograph_file import PHOTOGRAPHS
 from instrument.files.errors import count
 from instrument.runs.inspection import RunSummary, runs_and_photographs, summary
 from instrument.runs.run import RunCondition
-from recon.base.declare import Imports, expression
+from recon.base.as_python import Imports, expression
 
 _COLUMNS = ("run", "became", "frames", "kind", "bench")
 _REST_MS = 500

@@ -16,7 +16,7 @@ from gui.widgets.dialogues import elided, path_field
 from gui.widgets.image_view import ImageView
 from gui.widgets.plots import curve_pen, plot_widget
 from instrument.files.slm_image import SlmCorrection, load_slm_correction, read_slm_image, show_levels
-from recon.base.declare import Imports, expression
+from recon.base.as_python import Imports, expression
 
 _IMAGES = "Phase pictures (*.png *.tif *.tiff *.bmp *.npy)"
 

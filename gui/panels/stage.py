@@ -21,7 +21,7 @@ from gui.widgets.entry import NumberEdit, grouped, quantity
 from gui.widgets.image_view import step_factor
 from gui.widgets.kept_bar import KeptBar
 from instrument.plan import Plan
-from recon.base.declare import Imports
+from recon.base.as_python import Imports
 
 _STEPS = {"um": 100.0, "mrad": 1.0}
 """Steps to begin with, by unit: a tenth of a millimetre, a milliradian."""

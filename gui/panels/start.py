@@ -18,7 +18,7 @@ from gui.widgets.building import fill, in_row, label
 from gui.widgets.dialogues import choose_path
 from instrument.bench.config import BenchConfig
 from instrument.bench.config_file import load_config, tried_bench
-from recon.base.declare import Imports, expression
+from recon.base.as_python import Imports, expression
 
 _TRIED = {
     "default": (

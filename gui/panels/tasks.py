@@ -45,7 +45,8 @@ from instrument.files.calibration_file import newest_calibration
 from instrument.files.orientation import Kind
 from instrument.tasks import CHARTS, TASKS, VIDEOS
 from instrument.tasks.task import WRITTEN, Desk, Done, Task
-from recon.base.declare import Imports, Option, expression
+from recon.base.as_python import Imports, expression
+from recon.base.declare import Option
 
 _FOLDERS = ("FOLDER", "RUN", "CALIBRATION", "OLD", "NEW", "VIDEO|RUN", "RUN|RESULT", "SHEET")
 """What an option is called that names a folder."""

@@ -16,7 +16,7 @@ import os
 import re
 import typing
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from numbers import Integral, Real
 from pathlib import Path
 from typing import Any, TypeVar
@@ -24,12 +24,9 @@ from typing import Any, TypeVar
 from recon.errors import InputError
 
 _KEY = "declared"
-_LINE = 100
 RARE = "Rarely needed"
 """The group that help and forms show last."""
 _T = TypeVar("_T")
-Made = Callable[[Any, "Imports"], str]
-"""Returns the Python that makes a value, and adds what must be imported for it."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -384,11 +381,12 @@ def changed(options: object) -> Iterator[tuple[Option, Any]]:
     """Yield the options that differ from their defaults, with their values."""
     for o in options_of(options):
         value = getattr(options, o.name)
-        if value is not o.default and not _same(value, o.default):
+        if value is not o.default and not same(value, o.default):
             yield o, value
 
 
-def _same(one: Any, other: Any) -> bool:
+def same(one: Any, other: Any) -> bool:
+    """Whether two values are equal; arrays of several numbers are not taken for equal."""
     try:
         return bool(one == other)
     except ValueError:  # arrays
@@ -427,76 +425,3 @@ def _plain(value: Any) -> Any:
     if isinstance(value, Sequence):
         return [_plain(v) for v in value]
     return repr(value)
-
-
-@dataclass
-class Imports:
-    """What lines of Python need: ``from module import name`` pairs and plain modules."""
-
-    names: set[tuple[str, str]] = field(default_factory=set)
-    modules: set[str] = field(default_factory=set)
-
-    def lines(self) -> list[str]:
-        """Return the import lines: the standard library, an empty line, the project's."""
-        standard = [f"import {name}" for name in sorted(self.modules)]
-        standard += [
-            f"from pathlib import {name}" for module, name in sorted(self.names) if module == "pathlib"
-        ]
-        own = [f"from {module} import {name}" for module, name in sorted(self.names) if module != "pathlib"]
-        return [*standard, *([""] if standard and own else []), *own]
-
-
-def expression(
-    value: Any,
-    imports: Imports | None = None,
-    *,
-    special: Mapping[type, Made] | None = None,
-    indent: str = "",
-) -> str:
-    """Return the Python that makes a value, without what is default: "Copy as Python".
-
-    Parameters
-    ----------
-    value
-        Plain values, paths, enumerations, sequences of them, dataclasses.
-    imports : Imports, optional
-        Gets what must be imported.
-    special : mapping of type to callable, optional
-        How values of other types are made.
-    indent : str
-        Of the line that the expression stands in; a dataclass that does not fit into it is folded.
-    """
-    imports = Imports() if imports is None else imports
-    for kind, made in (special or {}).items():
-        if isinstance(value, kind):
-            return made(value, imports)
-    if isinstance(value, Path):
-        imports.names.add(("pathlib", "Path"))
-        return f"Path({str(value)!r})"
-    if isinstance(value, enum.Enum):
-        imports.names.add((type(value).__module__, type(value).__name__))
-        return f"{type(value).__name__}.{value.name}"
-    if dataclasses.is_dataclass(value) and not isinstance(value, type):
-        imports.names.add((type(value).__module__, type(value).__name__))
-        inner = indent + "    "
-        parts = [
-            f"{f.name}={expression(getattr(value, f.name), imports, special=special, indent=inner)}"
-            for f in dataclasses.fields(value)
-            if f.init and not _is_default(f, getattr(value, f.name))
-        ]
-        line = f"{type(value).__name__}({', '.join(parts)})"
-        if len(line) + len(indent) < _LINE and "\n" not in line:
-            return line
-        listed = "".join(f"{inner}{part},\n" for part in parts)
-        return f"{type(value).__name__}(\n{listed}{indent})"
-    if isinstance(value, list | tuple):
-        inside = [expression(one, imports, special=special, indent=indent) for one in value]
-        if isinstance(value, list):
-            return f"[{', '.join(inside)}]"
-        return f"({inside[0]},)" if len(inside) == 1 else f"({', '.join(inside)})"
-    return repr(value)
-
-
-def _is_default(f: dataclasses.Field[Any], value: Any) -> bool:
-    made = f.default_factory() if f.default_factory is not dataclasses.MISSING else f.default
-    return value is made or _same(value, made)

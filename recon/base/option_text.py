@@ -12,7 +12,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from recon.base.declare import Declaration, Option, changed, expression, options_of
+from recon.base.as_python import expression
+from recon.base.declare import Declaration, Option, changed, options_of
 from recon.errors import InputError
 
 

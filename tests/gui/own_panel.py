@@ -9,7 +9,8 @@ from PySide6.QtWidgets import QPushButton, QVBoxLayout, QWidget
 from gui.forms.options_form import OptionsForm
 from gui.panel import Panel
 from gui.session import BenchSession
-from recon.base.declare import expression, option
+from recon.base.as_python import expression
+from recon.base.declare import option
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -7,7 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 
-from recon.base.declare import changed, expression, mistakes, option, options_of, record, with_overrides
+from recon.base.as_python import expression
+from recon.base.declare import changed, mistakes, option, options_of, record, with_overrides
 from recon.camera.grid import FAR_UM
 from recon.errors import InputError
 from recon.reconstruction.options import ReconstructionOptions
