@@ -35,12 +35,18 @@ def test_parts_that_are_seen_are_painted_in_turns_of_their_own(qtbot: QtBot, win
     for part in parts:
         part.installEventFilter(watch)
     qtbot.wait(100)
-    together = 0
+    painted.clear()
+    together, seen, held = 0, set[QWidget](), set[QWidget]()
     for _ in change_theme("light", window, parts):
-        painted.clear()
+        freed, held = held, {part for part in parts if not part.updatesEnabled()}
+        freed -= held
+        qtbot.waitUntil(lambda freed=freed: freed <= set(painted), timeout=WAIT_MS)  # type: ignore[misc]
         qtbot.wait(30)
         together = max(together, len(set(painted)))
+        seen |= set(painted)
+        painted.clear()
     assert window.updatesEnabled()
+    assert {part for part in parts if part.isVisible()} <= seen, "no paint was seen"
     assert all(part.updatesEnabled() and part.styleSheet() == sheet() for part in parts)
     assert together <= 1
 
