@@ -89,6 +89,10 @@ def size(typed: str) -> tuple[int, int]:
     raise ValueError("write rows x columns, two whole numbers above 0, for example 3x5.")
 
 
+_MOST_DIGITS = 1e12
+"""Whole numbers from here on have an exponent."""
+
+
 def shown(o: Option, value: Any) -> str:
     """Return a value as people type it."""
     if value is None:
@@ -98,7 +102,8 @@ def shown(o: Option, value: Any) -> str:
     if isinstance(value, int | float) and not isinstance(value, bool):
         if value == o.declaration.infinity:
             return "inf"
-        return f"{value / o.declaration.shown_factor:.6g}"
+        number = value / o.declaration.shown_factor
+        return f"{number:.0f}" if abs(number) < _MOST_DIGITS and number == round(number) else f"{number:.6g}"
     if isinstance(value, tuple | list):
         return ("," if "," in o.declaration.metavar else " ").join(shown(o, one) for one in value)
     return str(value)

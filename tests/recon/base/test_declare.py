@@ -9,6 +9,7 @@ import pytest
 
 from recon.base.as_python import expression
 from recon.base.declare import changed, mistakes, option, options_of, record, with_overrides
+from recon.base.option_text import command_line, shown
 from recon.camera.grid import FAR_UM
 from recon.errors import InputError
 from recon.reconstruction.options import ReconstructionOptions
@@ -52,6 +53,13 @@ def test_what_differs_from_the_defaults_is_recorded_and_said() -> None:
 
 def test_labels_have_the_unit_that_people_read() -> None:
     assert [o.label for o in options_of(Some)] == ["Count", "Kind", "Z (mm)", "Here"]
+
+
+def test_whole_numbers_are_typed_whole() -> None:
+    assert command_line("some", Some(count=123_456_789)).endswith("--count 123456789")  # was 1.23457e+08
+    count = options_of(Some)[0]
+    assert shown(count, (30_000, 1e6, 1e7, 0.25)) == "30000 1000000 10000000 0.25"
+    assert shown(count, 1e15) == "1e+15"
 
 
 def test_an_unknown_override_is_refused_with_the_nearest_name() -> None:
