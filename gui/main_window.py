@@ -16,13 +16,11 @@ from PySide6.QtWidgets import (
     QMenu,
     QMenuBar,
     QMessageBox,
-    QProgressBar,
     QSizePolicy,
     QWidget,
 )
 
 from gui.help import help_of
-from gui.jobs import Job
 from gui.making import PICTURE_MS, REST_MS, PanelMaker, take_slice
 from gui.panel import Panel
 from gui.panels import PANELS
@@ -34,9 +32,9 @@ from gui.widgets.building import PanelPlace, button, fill, in_row, label, tabs
 from gui.widgets.device_chips import DeviceChips
 from gui.widgets.dialogues import Question, TextWindow
 from gui.widgets.entry import NumberEdit
+from gui.widgets.status_line import StatusLine
 from gui.widgets.step_strip import StepStrip
 from gui.widgets.tab_order import stops_of
-from gui.words import in_the_window
 from instrument.bench.config import BenchConfig, Kind
 
 _AREAS = {
@@ -94,7 +92,8 @@ class MainWindow(QMainWindow):
         self.tabs = tabs({})
         self.setCentralWidget(self.tabs)
         self._make_top_bar()
-        self._make_status_bar()
+        self.status = StatusLine(session, self)
+        self.setStatusBar(self.status)
         self._make_panels()
         self._make_menus()
         self._make_stop_keys()
@@ -106,8 +105,6 @@ class MainWindow(QMainWindow):
         session.opened.connect(
             lambda: QTimer.singleShot(PICTURE_MS if session.kinds else 0, self, self.maker.prepare)
         )
-        session.jobs.job_started.connect(self._job_started)
-        session.jobs.job_ended.connect(self._job_ended)
         self.resize(size)
         self._restore_layout()
         self._show_simulated()
@@ -229,20 +226,6 @@ class MainWindow(QMainWindow):
         self._header = fill(QWidget(), first, self.strip, spacing=0)
         self._header.setObjectName("header")
         self.setMenuWidget(self._header)
-
-    def _make_status_bar(self) -> None:
-        self.job_label = label("Ready", yields=True)
-        self.job_label.setContentsMargins(6, 0, 0, 0)
-        self.job_progress = QProgressBar()
-        self.job_progress.setRange(0, 0)
-        self.job_progress.setFixedWidth(140)
-        self.job_progress.hide()
-        self.statusBar().addWidget(self.job_progress)
-        self.statusBar().addWidget(self.job_label, 1)
-        self._problem = ""
-        """The warning or error that was told last."""
-        self.session.logged.connect(self._show_problem)
-        self.session.device_changed.connect(self._forget_problem)
 
     def _make_menus(self) -> None:
         view = self.menus.addMenu("&View")
@@ -374,43 +357,6 @@ class MainWindow(QMainWindow):
         everything = len(simulated) == len(self.session.kinds)
         self.simulated.setText("SIMULATED" if everything else f"SIMULATED: {', '.join(simulated)}")
 
-    def _job_started(self, job: Job) -> None:
-        if job.quiet:
-            return
-        if job.exclusive or not job.lanes:
-            self.job_progress.show()
-        self.job_label.setText(f"{job.title} …")
-
-    def _job_ended(self, job: Job) -> None:
-        if job.quiet:
-            return
-        running = self._shown_jobs()
-        self.job_progress.setVisible(any(j.exclusive or not j.lanes for j in running))
-        if running:
-            self.job_label.setText(f"{running[0].title} …")
-        # What was told meanwhile stays.
-        elif self.job_label.text() == f"{job.title} …":
-            became = {"succeeded": job.became, "cancelled": "ended early"}.get(job.state.value, "failed")
-            self.job_label.setText(f"{job.title}: {became}")
-
-    def _shown_jobs(self) -> list[Job]:
-        """Return what runs and would be missed: runs, moves, photographs, computations."""
-        return [job for job in self.session.jobs.jobs if not job.quiet]
-
-    def _show_problem(self, level: str, text: str) -> None:
-        if level in ("warning", "error"):
-            self._problem = text
-            self.job_label.setText(text.splitlines()[0][:200])
-
-    def _forget_problem(self, kind: str) -> None:
-        """Take a device's failure away that is over; the log keeps it."""
-        device = self.session.bench.devices.get(cast(Kind, kind))
-        mended = (
-            device is not None and self.session.is_open(kind) and in_the_window(device.name) in self._problem
-        )
-        if mended and self.job_label.text() == self._problem.splitlines()[0][:200]:
-            self.job_label.setText("Ready")
-
     def _ask_operator(self, request: OperatorRequest) -> None:
         answers = ("Done", "Stop")
         box = self._ask(_BY_HAND, "To be done by hand", request.text, answers, request.answer)
@@ -441,7 +387,7 @@ class MainWindow(QMainWindow):
             event.accept()
             return
         event.ignore()
-        running = [job.title for job in self._shown_jobs()]
+        running = [job.title for job in self.status.jobs]
         if running and self._closing_question is not None:
             self._closing_question.ask()
         elif running:
@@ -459,7 +405,7 @@ class MainWindow(QMainWindow):
             self.next_bench = None
 
     def _end(self) -> None:
-        self.job_label.setText("Closing: light off, motion stopped …")
+        self.status.words.setText("Closing: light off, motion stopped …")
         with ExitStack() as each:  # one that fails keeps neither the others nor the bench from their end
             each.callback(self.session.close)
             each.callback(self.maker.shutdown)

@@ -16,7 +16,6 @@ import tty
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, nullcontext
 from types import FrameType
-from typing import Any
 
 from rich.console import Console
 from rich.progress import (
@@ -35,6 +34,7 @@ from rich.text import Text
 from instrument.files import kept_times
 from instrument.files.errors import duration
 from instrument.tasks.task import Advance
+from recon.base.compiling import being_compiled
 
 _WIDE = 120  # characters of a terminal that has room for a long bar
 
@@ -69,36 +69,14 @@ class _Left(TimeRemainingColumn):
 
 
 class _Note(ProgressColumn):
-    """The task's note, or what is being compiled; asked often, it hears of numba when that is there."""
+    """The task's note, or what is being compiled."""
 
     def __init__(self) -> None:
         super().__init__(Column(no_wrap=True, overflow="ellipsis", ratio=1))
 
     def render(self, task: Task) -> Text:
-        _listen()
-        now = _compiled[-1:]  # another thread ends it
-        return Text(f"compiling {now[0]} (once)" if now else task.fields["note"])
-
-
-_compiled: list[str] = []
-_heard: list[Any] = []
-
-
-def _listen() -> None:
-    """Hear of what numba compiles, from when it is imported on."""
-    if _heard or "numba.core.event" not in sys.modules:
-        return
-    from numba.core import event
-
-    class Compilations(event.Listener):
-        def on_start(self, event: Any) -> None:
-            _compiled.append(event.data["dispatcher"].py_func.__name__.strip("_"))
-
-        def on_end(self, event: Any) -> None:
-            del _compiled[-1:]
-
-    _heard.append(Compilations())
-    event.register("numba:compile", _heard[0])  # type: ignore[no-untyped-call]
+        now = being_compiled()
+        return Text(f"compiling {now} (once)" if now else task.fields["note"])
 
 
 def progress_bar() -> Progress:

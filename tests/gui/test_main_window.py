@@ -166,7 +166,7 @@ def test_an_unplugged_camera_is_named_and_comes_back(qtbot: QtBot, window: MainW
     qtbot.mouseClick(button, Qt.MouseButton.LeftButton)
     qtbot.waitUntil(lambda: not session.jobs.jobs, timeout=WAIT_MS)
     assert session.state("camera").condition == "failed"
-    assert "unplugged" in window.job_label.text(), "not that connecting is done"
+    assert "unplugged" in window.status.words.text(), "not that connecting is done"
     world.plug_in("camera")  # type: ignore[attr-defined]
     qtbot.mouseClick(button, Qt.MouseButton.LeftButton)
     qtbot.waitUntil(lambda: session.live.newest() is not None, timeout=WAIT_MS)
@@ -355,7 +355,7 @@ def test_closing_asks_before_a_short_job_is_broken_off_and_not_before_a_listing(
     window.close()
     assert window.question is not None
     assert "Homing the stage is running" in window.question.text()
-    assert window.job_label.text() == "Homing the stage …"
+    assert window.status.words.text() == "Homing the stage …"
     window.question.reject()
     gate.set()
     qtbot.waitUntil(lambda: job.is_over, timeout=WAIT_MS)
@@ -396,7 +396,7 @@ def test_nobody_is_asked_to_close_what_was_only_just_opened(
 
 def test_lists_are_read_without_a_word(window: MainWindow) -> None:
     window.panel("runs").read_folder()  # type: ignore[attr-defined]
-    window.panel("reconstructions").refresh()  # type: ignore[attr-defined]
+    window.panel("reconstructions").results.refresh()  # type: ignore[attr-defined]
     listings = [job for job in window.session.jobs.jobs if not job.lanes]
     assert listings
     assert all(job.quiet for job in listings)
@@ -423,7 +423,7 @@ def test_panels_are_prepared_before_they_are_asked_for(
     monkeypatch.setattr(PanelEntry, "load", load)
     window.maker.prepare()
     qtbot.waitUntil(lambda: len(loaded) == len(PANELS), timeout=WAIT_MS)
-    assert "lacks" not in window.job_label.text(), "it is told where the panel is opened"
+    assert "lacks" not in window.status.words.text(), "it is told where the panel is opened"
 
 
 def test_an_import_that_is_broken_off_leaves_no_panel_opening_for_ever(

@@ -99,7 +99,7 @@ def test_a_target_can_be_entered_again_after_stop(
         _type(qtbot, target, "290")
         qtbot.keyClick(target, Qt.Key.Key_Return)
         qtbot.waitUntil(lambda: device.is_moving, timeout=WAIT_MS)
-        assert "Move z to 290 mm" in window.job_label.text()
+        assert "Move z to 290 mm" in window.status.words.text()
         with qtbot.waitSignal(window.session.stopped, timeout=WAIT_MS):
             qtbot.keyClick(target, Qt.Key.Key_Escape)
         here = device.position()["z_um"]

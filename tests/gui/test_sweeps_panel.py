@@ -230,8 +230,8 @@ def test_abort_keeps_what_was_taken(qtbot: QtBot, window: MainWindow, panel: Swe
     words = panel.verdict.toPlainText()
     assert str(run.path) in words
     assert "diffuserbench resume" not in words, "the operator has no terminal"
-    qtbot.waitUntil(lambda: window.job_label.text() != "Axial sweep …", timeout=WAIT_MS)
-    assert window.job_label.text() == "Axial sweep: ended early"
+    qtbot.waitUntil(lambda: window.status.words.text() != "Axial sweep …", timeout=WAIT_MS)
+    assert window.status.words.text() == "Axial sweep: ended early"
     assert not panel.verdict.property("refused"), "what was asked for is no error"
     press(qtbot, panel.way_on.go_on_button)
     assert panel.no_frame.isVisible(), "nothing of the run before"
