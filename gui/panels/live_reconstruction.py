@@ -19,6 +19,7 @@ from gui.forms.options_form import FOLDED, OptionsForm
 from gui.jobs import Job, JobContext
 from gui.live_calibration import calibration_of, depths_um, last_or_newest
 from gui.live_depth import DepthSeeker
+from gui.live_doubts import LiveDoubts
 from gui.live_follower import LiveFollower
 from gui.panel import Panel, on_bench
 from gui.session import BenchSession
@@ -27,9 +28,8 @@ from gui.widgets.dialogues import elided, path_field
 from gui.widgets.entry import NumberEdit
 from gui.widgets.image_view import ImageView
 from gui.widgets.orientation import OrientationButton, follow_orientation
-from instrument.bench.photograph import SPOILT
 from instrument.files.calibration_file import find_calibration, load_calibration
-from instrument.files.errors import BenchError, count, duration, percent
+from instrument.files.errors import BenchError, count, duration
 from instrument.live.light_log import NOTHING_LIT
 from instrument.live.live import LiveResult
 from recon.base.as_python import Imports, expression
@@ -44,7 +44,6 @@ from recon.types import Calibration
 _LOOK_MS = 50
 _BUDGET_MS = 80.0
 """A picture's time: twelve a second leave half of a two-core machine to the camera and the window."""
-_PATIENCE_S = 1.5
 """Without a frame for longer than this and three exposures, the picture is called old."""
 _TELL_S = 0.5
 """Figures below the picture are written this often, at most: each time the panel is laid out and painted."""
@@ -97,6 +96,7 @@ class LiveReconstructionPanel(Panel):
         """How quickly the picture shown came, and what it is worth; what of that is written."""
         self._told_s = 0.0
         self._seeker = DepthSeeker(session, self._use_depth)
+        self._doubts = LiveDoubts(session)
         self._logged: tuple[str, ...] = ()
         """Warnings of the reconstructor in use that are in the log already."""
 
@@ -124,6 +124,7 @@ class LiveReconstructionPanel(Panel):
             start=session.runs_folder,
         )
         self.plane = choice((), "Depth of the scene: which PSFs of the calibration are used")
+        self.plane.hide()  # until a calibration has several
         self.plane.setSizeAdjustPolicy(QComboBox.SizeAdjustPolicy.AdjustToContents)
         self.plane.activated.connect(self._seeker.leave)
         self.plane.activated.connect(self._rebuild)
@@ -336,7 +337,7 @@ class LiveReconstructionPanel(Panel):
             elided(self.status, self.follower.problem)
             self._call_old("the preview has ended, see below")
             return
-        silent = self._silence()
+        silent = self._doubts.of_silence(self._shown)
         if silent and self.session.live.stream is None:
             self._call_old(silent)
             return
@@ -358,7 +359,7 @@ class LiveReconstructionPanel(Panel):
         else:
             if self.loaded is not None:
                 self._seeker.see(result, self.loaded.reconstructor)
-            self.view.caution_against(self._doubt(result))
+            self.view.caution_against(self._doubts.of(result, self._seeker.words))
         self.view.set_caption(self._caption(result.metadata))
         # What is doubted stands over the picture.
         worth = result.picture.quality.removeprefix(result.picture.doubt).removeprefix(": ")
@@ -377,38 +378,11 @@ class LiveReconstructionPanel(Panel):
         self._told, self._told_s = words, now_s
         self.status.setText(_lines(words))
 
-    def _silence(self) -> str:
-        """Say for how long no frame has come, where one should have; of the picture's own with no stream."""
-        shown, stream = self._shown, self.session.live.stream
-        if shown is None:
-            return ""
-        newest = None if stream is None else stream.newest()
-        metadata = shown.metadata if newest is None else newest.metadata
-        age_s = (time.monotonic_ns() - metadata.host_time_ns) / 1e9
-        if stream is not None and age_s < _PATIENCE_S + 3e-3 * metadata.exposure_ms:
-            return ""
-        return f"no frame has come for {duration(age_s)}"
-
     def _call_old(self, why: str) -> None:
         """Say over the picture that it stays while no other comes: of frames, or of the preview."""
         if self._shown is not None:
-            doubt = self._doubt(self._shown)
+            doubt = self._doubts.of(self._shown, self._seeker.words)
             self.view.caution_against(". ".join(filter(None, (f"Old picture: {why}", doubt))), old=True)
-
-    def _doubt(self, result: LiveResult) -> str:
-        """Return what is doubtful about a picture: by its pixels, and by what its frame was."""
-        of_pixels, of_frame = result.picture.doubt, self._frame_doubt(result.metadata)
-        if of_pixels and self.session.lights.during(result.metadata) == NOTHING_LIT:
-            return of_pixels  # which says it
-        return ". ".join(filter(None, (of_frame, self._seeker.words or of_pixels)))
-
-    def _frame_doubt(self, frame: FrameMetadata) -> str:
-        """Return what is doubtful about a frame: its light, its exposure."""
-        if self.session.lights.during(frame) == NOTHING_LIT:
-            return "Its frame was taken with nothing lit"
-        if frame.saturated_fraction > SPOILT:
-            return f"{percent(frame.saturated_fraction)} of its frame's pixels are saturated: expose shorter"
-        return ""
 
     def _caption(self, frame: FrameMetadata) -> str:
         """Say of which frame a picture is, and with which calibration it was made."""
@@ -499,15 +473,15 @@ class LiveReconstructionPanel(Panel):
         elided(
             self.status,
             f"Refined: {result.solver} with {result.prior}, {len(result.history)} iterations, "
-            f"{result.seconds:.1f} s, {result.stop_reason}. {' '.join(result.warnings)}",
+            f"{result.seconds:.1f} s, {result.stop_reason}. {self.in_its_words(' '.join(result.warnings))}",
         )
 
     def _refined_doubt(self, frame: FrameMetadata) -> str:
         """Return what was doubtful about the frame that was refined, as its preview had it."""
         shown = self._shown
         if shown is not None and shown.metadata.frame_id == frame.frame_id:
-            return self._doubt(shown)
-        return self._frame_doubt(frame)
+            return self._doubts.of(shown, self._seeker.words)
+        return self._doubts.of_frame(frame)
 
     def _refining_ended(self) -> None:
         self._refining = None

@@ -107,7 +107,7 @@ def test_a_picture_of_noise_is_called_so_by_its_own_frame_and_an_old_one_old(
     qtbot.waitUntil(lambda: panel.view.caution.startswith("Old picture"), timeout=WAIT_MS)
     held.set()
     qtbot.waitUntil(lambda: job.is_over and not panel.view.caution, timeout=WAIT_MS)
-    monkeypatch.setattr("gui.panels.live_reconstruction._PATIENCE_S", 0.3)
+    monkeypatch.setattr("gui.live_doubts._PATIENCE_S", 0.3)
     session.camera_job("Trigger", lambda camera: camera.set_trigger_mode("software"), idle=True)
     qtbot.waitUntil(
         lambda: session.live.stream is not None and panel.view.caution.startswith("Old picture: no frame"),

@@ -44,6 +44,8 @@ _IN_WINDOW = ("recon", "instrument", "calibration_routines")
             "Choose another name, or overwrite with --force.",
             "Choose another name, or overwrite with “Overwrite”.",
         ),
+        ("4.1 % larger (falls to 78%), 5%.", "4.1 % larger (falls to 78 %), 5 %."),
+        ("/data/50%/x and 50%-off", "/data/50%/x and 50 %-off"),
         ("d 8.82 +- 0.14 mm, off by 1.7 um (--reach-um).", "d 8.82 ± 0.14 mm, off by 1.7 µm (--reach-um)."),
     ],
 )
