@@ -60,7 +60,7 @@ def main() -> int:
         good, words = _carried_out(panel, name, made)
         wrong = list(faults(window))
         failed += [] if good and not wrong else [name]
-        files = ", ".join(path.name for path in panel.files) or "no files"
+        files = ", ".join(path.name for path in panel.found.files) or "no files"
         print(f"{'' if good else 'FAILS '}{name}: {time.monotonic() - began_s:.0f} s, {files}")
         print(f"    {' '.join(words.split())[-300:]}", *wrong, sep="\n    ", flush=True)
         shots._grab(window, given.folder / f"{name.replace(' ', '-')}.png")
@@ -146,7 +146,7 @@ def _carried_out(panel: TasksPanel, name: str, made: dict[str, dict[str, Any]]) 
     shots._wait(lambda: not panel.run.is_running, f"{name} to end")
     for connection in told:
         panel.disconnect(connection)
-    words = panel.words.toPlainText() or panel._note.text()
+    words = panel.found.words.toPlainText() or panel._note.text()
     return ended == [""], words if ended != [""] or words else "no words"
 
 

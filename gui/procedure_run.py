@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Protocol
 
-from PySide6.QtCore import QObject, Signal
+from PySide6.QtCore import QObject, Qt, Signal
 from PySide6.QtWidgets import QWidget
 
 from calibration_routines.display.spot_camera import SpotLook
@@ -24,6 +24,7 @@ from gui.jobs import Job, JobContext
 from gui.panel import on_bench
 from gui.session import BenchSession
 from gui.widgets.building import button, every, fill, in_row, label, share_bar
+from gui.widgets.tab_order import take_turns
 from instrument.bench.photograph import Snapshot
 from instrument.files.errors import duration
 from instrument.plan import Plan
@@ -344,6 +345,8 @@ class RunBar(QWidget):
         """Whether it was aborted, and goes on to where it can end."""
         self.bar = share_bar(_STEPS)
         self.words = label(role="dim", wraps=True, yields=True)
+        self.words.setMinimumHeight(2 * self.words.fontMetrics().lineSpacing() + 2)  # the buttons stay
+        self.words.setAlignment(Qt.AlignmentFlag.AlignLeft | Qt.AlignmentFlag.AlignTop)
         buttons = in_row((self.start_button, 2), self.pause_button, self.abort_button)
         fill(self, buttons, self.bar, self.words, margins=(0, 4, 0, 0))
         run.looked.connect(self.show_situation)
@@ -366,10 +369,10 @@ class RunBar(QWidget):
     def set_running(self, running: bool) -> None:
         """Show the buttons for a procedure that runs, or for none."""
         self._ending = False
-        self.pause_button.setEnabled(running)
-        self.abort_button.setEnabled(running)
+        ends = (self.pause_button, self.abort_button)
+        start = () if self._why_not else (self.start_button,)
+        take_turns(*((ends, (self.start_button,)) if running else (start, ends)))
         self.pause_button.setChecked(False)
-        self._show_start(running=running)
         if running:
             self.bar.setValue(0)
             self.words.setText("Beginning")

@@ -16,6 +16,8 @@ from gui.forms.fields import Behaviour
 from gui.forms.options_form import FOLDED, OptionsForm
 from gui.jobs import JobContext
 from gui.widgets.building import button, fill, in_row, label, scrolled, share_bar
+from gui.widgets.dialogues import IMAGES
+from gui.widgets.tab_order import take_turns
 from instrument.files.errors import BenchError
 from instrument.reconstruction.checkpointing import checkpoint_for, require_kept, settle_checkpoint
 from instrument.reconstruction.forecast import Forecast
@@ -39,7 +41,6 @@ from recon.solvers.base import IterationRecord
 CALIBRATION, PSF, VOLUME = "Picture (calibration)", "Picture (PSF image)", "Volume (PSFs)"
 SOURCES = {CALIBRATION: "calibration", PSF: "psf", VOLUME: "volume"}
 """The option that names the PSFs of each kind."""
-_IMAGES = "Images (*.tif *.tiff *.png *.npy *.npz *.bmp *.jpg);;All files (*)"
 _OF_A_PSF_IMAGE = ("allow_saturated", "allow_mixed_depth")
 _MOST_DEPTHS = 8
 """More of them are named as a range."""
@@ -94,8 +95,8 @@ class ReconstructForm(QWidget):
         self.options = OptionsForm(
             [_KindOptions, *source, ReconstructionOptions, InputOptions, *output],
             {
-                "image": Behaviour(filters=_IMAGES, must_exist=True, needed=True),
-                "psf": Behaviour(filters=_IMAGES, must_exist=True, needed=True),
+                "image": Behaviour(filters=IMAGES, must_exist=True, needed=True),
+                "psf": Behaviour(filters=IMAGES, must_exist=True, needed=True),
                 "calibration": Behaviour(must_exist=True, needed=True),
                 "volume": Behaviour(browse="folder", must_exist=True, needed=True),
                 "z_um": Behaviour(needed_when=self._which_depth),
@@ -195,9 +196,8 @@ class ReconstructForm(QWidget):
     def set_running(self, running: bool, *, keeps: bool = True) -> None:
         """Let it be started, or stopped, which ``keeps`` what there is then or nothing."""
         self.stop.setText("Stop and keep" if keeps or not running else "Stop")
-        self.start.setEnabled(not running)
-        self.explain.setEnabled(not running)
-        self.stop.setEnabled(running)
+        begin, end = (self.start, self.explain), (self.stop,)
+        take_turns(*((end, begin) if running else (begin, end)))
         if not running:
             self.progress.setValue(0)
 

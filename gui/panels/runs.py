@@ -219,7 +219,7 @@ class RunsPanel(Panel):
         self.table.setColumnHidden(len(_COLUMNS) - 1, simulated)  # said once
         self.table.setColumnHidden(_COLUMNS.index("kind"), not photographs)
         said += ", SIMULATED," if simulated else ""
-        self.where.setText(f"{said} in {folder.name} of {folder.parent.name}")
+        self.where.setText(f"{said} in {folder.parent.name}/{folder.name}")
         self.where.setToolTip(str(folder))
         self.where.setVisible(bool(summaries))
         self.hint.setVisible(not summaries)

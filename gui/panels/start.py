@@ -15,7 +15,7 @@ from gui.panels.new_bench import NewBench
 from gui.session import BenchSession
 from gui.session_news import OwnFiles
 from gui.widgets.building import fill, in_row, label
-from gui.widgets.dialogues import choose_path
+from gui.widgets.dialogues import IMAGES, choose_path
 from instrument.bench.config import BenchConfig
 from instrument.bench.config_file import load_config, tried_bench
 from recon.base.as_python import Imports, expression
@@ -43,7 +43,6 @@ _TRIED = {
     ),
 }
 _WRITTEN = "its bench.toml is written into a folder of its own, with its runs beside it"
-_IMAGES = "Images (*.tif *.tiff *.png *.npy *.npz *.bmp *.jpg);;All files (*)"
 _COLUMNS = 2
 _WIDEST_PX = 900
 _CARD_PX = 64
@@ -157,13 +156,13 @@ class StartPanel(Panel):
     # Files ---------------------------------------------------------------------------------------
     def _choose_psf(self) -> None:
         words = "First the PSF: what one point of light gives"
-        choose_path(self, "open", words, "", self._psf_chosen, _IMAGES)
+        choose_path(self, "open", words, "", self._psf_chosen, IMAGES)
 
     def _psf_chosen(self, psf: Path) -> None:
         def then(photograph: Path) -> None:
             self.session.handed_on.emit("reconstructions", OwnFiles(photograph, psf))
 
-        choose_path(self.page, "open", "Now the photograph", str(psf.parent), then, _IMAGES)
+        choose_path(self.page, "open", "Now the photograph", str(psf.parent), then, IMAGES)
 
     def _choose_result(self) -> None:
         def chosen(path: Path) -> None:

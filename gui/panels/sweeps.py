@@ -29,7 +29,8 @@ from gui.widgets.building import fill, hint, label, split, tabs
 from gui.widgets.dialogues import elided
 from gui.widgets.image_view import ImageView, usual_levels
 from gui.widgets.orientation import follow_orientation
-from gui.widgets.sweep_views import PathPlot, Picture, PsfPictures, PsfTable
+from gui.widgets.picture import Picture
+from gui.widgets.sweep_views import PathPlot, PsfPictures, PsfTable
 from instrument.bench.photograph import Snapshot
 from instrument.files.errors import BenchError, FileError, SettingsError, count
 from instrument.live.frame_view import not_stretched

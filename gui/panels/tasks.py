@@ -8,9 +8,8 @@ from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple, get_args
 
-from PySide6.QtCore import Qt, QTimer, QUrl
-from PySide6.QtGui import QDesktopServices, QFontDatabase, QImage, QPixmap
-from PySide6.QtWidgets import QListWidget, QListWidgetItem, QTableWidget, QVBoxLayout, QWidget
+from PySide6.QtCore import Qt
+from PySide6.QtWidgets import QWidget
 
 from calibration_routines.psf.sweep_plan import SWEEP
 from gui.background import NewestOnly
@@ -25,22 +24,15 @@ from gui.session_news import OwnFiles
 from gui.task_run import TaskRun, Told
 from gui.widgets.building import (
     after_rest,
-    button,
-    cell,
     choice,
     fill,
-    in_row,
     label,
-    mark,
     split,
-    table,
-    tabs,
-    text_view,
 )
-from gui.widgets.orientation import orientation_of, read_turned
-from gui.widgets.sweep_views import Picture
+from gui.widgets.found_view import FoundView
+from gui.widgets.orientation import orientation_of
 from gui.widgets.tab_order import tab_in_order
-from gui.words import in_the_window, in_two_lines, level_of, with_signs
+from gui.words import in_the_window, level_of, with_signs
 from instrument.files.calibration_file import newest_calibration
 from instrument.files.orientation import Kind
 from instrument.tasks import CHARTS, TASKS, VIDEOS
@@ -52,8 +44,6 @@ _FOLDERS = ("FOLDER", "RUN", "CALIBRATION", "OLD", "NEW", "VIDEO|RUN", "RUN|RESU
 """What an option is called that names a folder."""
 _FILMS = ("run", "video")
 """Options that name what a calibration is needed for."""
-_PICTURES = (".png", ".jpg", ".svg")
-_ROW_PX = 26
 _LEAST_FORM_PX = 300
 _CALIBRATION = "calibration"
 
@@ -77,15 +67,14 @@ class TasksPanel(Panel):
         self._pages: dict[str, _Page] = {}
         """Those whose forms are whole."""
         self._loader = NewestOnly(session.jobs, "Preparing a form", lambda why: self.refused(None, why))
-        self._reader = NewestOnly(session.jobs, "Reading a picture")
         self._newest = NewestOnly(session.jobs, "Looking for the newest calibration")
         self._given: dict[str, Path] = {}
-        self.files: tuple[Path, ...] = ()
         self._lent_px = 0
         """Width that the form has lent to a table, until it is taken back or the border is moved."""
 
     def parts(self) -> Iterator[None]:
         """Make the widgets."""
+        session = self.session
         self.choice = choice((), "What to do")
         self.choice.setAccessibleName("Task")
         for name, entry in TASKS.items():
@@ -100,9 +89,13 @@ class TasksPanel(Panel):
         self.run_bar = RunBar(self.run, "Start", tips=(tip, end))
         left = fill(QWidget(), self.choice, self.about, (self.stack, 1), self.run_bar, margins=(0, 0, 6, 0))
         yield
-        results = self._make_results()
+        seen = partial(orientation_of, session, "results")
+        self.found = FoundView(session.jobs, seen)
+        self.found.lacks.connect(self._lend)
+        self.found.opened.connect(self._open_result)
+        self.found.used.connect(self._use)
         yield
-        self._across = split(left, results, sizes=[430, 800], stretch=1, firm=True)
+        self._across = split(left, self.found, sizes=[430, 800], stretch=1, firm=True)
         self._across.splitterMoved.connect(lambda _x, _i: setattr(self, "_lent_px", 0))
         fill(self.body, self._across)
         self.choice.currentIndexChanged.connect(self._chosen)
@@ -114,37 +107,13 @@ class TasksPanel(Panel):
         self.run.over.connect(self._over)
         self._running = self.name
         """The task that goes on, or went on last."""
+        self._refused = False
+        """Whether it failed, and says why."""
         self._out: Path | None = None
         """Its result."""
         self._calibrations: Sequence[Path] = ()
         """Which of the files that it wrote are calibrations."""
         self._chosen()
-
-    def _make_results(self) -> QWidget:
-        self.words = text_view(tip="Can be copied", empty="What is found stands here.")
-        self.words.setFont(QFontDatabase.systemFont(QFontDatabase.SystemFont.FixedFont))
-        self.tables = QWidget()
-        self._tables = QVBoxLayout(self.tables)
-        self._tables.setContentsMargins(0, 0, 0, 0)
-        self.tables.hide()
-        self.picture = Picture()
-        self.list = QListWidget()
-        self.list.setAccessibleName("Files that were written")
-        self.list.setToolTip("What was written; a click shows a picture, a double click opens a file")
-        self.list.itemClicked.connect(lambda item: self._show(item.data(Qt.ItemDataRole.UserRole)))
-        self.list.itemActivated.connect(lambda item: self._open_result(item.data(Qt.ItemDataRole.UserRole)))
-        self.folder_button = button("Open folder", "Show it in the file manager", self._open_folder)
-        self.use_button = button(
-            "Go on with it…", "Take the result to the panel that works with it", self._use
-        )
-        told = fill(QWidget(), (self.words, 1), (self.tables, 1), margins=(6, 0, 0, 0))
-        self.results = tabs({"What was found": told, "Picture": self.picture})
-        foot = in_row((self.list, 1), fill(QWidget(), self.use_button, self.folder_button, None))
-        self.below = QWidget()
-        """What was written; nothing stands there before."""
-        fill(self.below, foot, margins=(6, 0, 0, 0))
-        self._clear()
-        return split(self.results, self.below, sizes=[560, 130], down=True, firm=True)
 
     def wholes(self) -> list[QWidget]:
         """Return the pages of the forms: after a day there are many."""
@@ -239,6 +208,9 @@ class TasksPanel(Panel):
         self._pages[name] = _Page(task, form, names)
 
     def _settled(self, name: str, field: str) -> None:
+        if name == self._running and self._refused and not self.run.is_running:
+            self._clear()  # what stood against it may be mended
+            self.run_bar.clear()
         if field in _FILMS and name in self._pages:
             self._look_for_calibration(name)
 
@@ -330,50 +302,23 @@ class TasksPanel(Panel):
             self.start()
 
     def _clear(self) -> None:
-        self._reader.forget()  # a picture of what was there before
-        self.words.setPlainText("")
-        self.words.show()
-        self.results.setCurrentIndex(0)  # a picture comes to the front once there is one
-        mark(self.words, "refused", False)
-        while (item := self._tables.takeAt(0)) is not None:
-            if (widget := item.widget()) is not None:
-                widget.deleteLater()
-        self.tables.hide()
+        self._refused = False
+        self.found.clear()
         self._take_back()
-        self.picture.clear()
-        self.list.clear()
-        self.files = ()
-        self.folder_button.setEnabled(False)
-        self.below.hide()
-        self.use_button.setEnabled(False)
 
     def _told(self, told: Told) -> None:
         text = self._pages[self._running].form.in_its_words(in_the_window(told.text))
         if told.kind == "table":
-            made = table(
-                [in_two_lines(with_signs(heading)) for heading in told.headings], text, row_px=_ROW_PX
-            )
-            made.setRowCount(len(told.rows))
-            for row, texts in enumerate(told.rows):
-                for column, shown in enumerate(texts):
-                    made.setItem(row, column, cell(with_signs(shown), number=True))
-            made.verticalHeader().hide()
-            self._tables.addWidget(made)
-            self.tables.show()
-            self.words.setVisible(bool(self.words.toPlainText()))
-            QTimer.singleShot(0, self, self._lend)  # once it has its place
+            self.found.add_table(told.headings, told.rows, text)
             return
         if told.kind == "warn":
             level, said = level_of(text)
             self.session.log(level, said)
             text = f"⚠ {said}" if level == "warning" else text
-        self.words.appendPlainText(text)
-        self.words.show()
+        self.found.say(text)
 
-    def _lend(self) -> None:
-        """Give the tables what they lack of the form's width, until something else is shown."""
-        shown = self.tables.findChildren(QTableWidget)
-        lacking = max((t.horizontalHeader().length() - t.viewport().width() for t in shown), default=0)
+    def _lend(self, lacking: int) -> None:
+        """Give tables and pictures what they lack of the form's width, until something else is shown."""
         form, results = self._across.sizes()
         if (more := min(lacking, form - _LEAST_FORM_PX)) > 0:
             self._lent_px += more
@@ -386,17 +331,12 @@ class TasksPanel(Panel):
             self._across.setSizes([form + lent, results - lent])
 
     def _succeeded(self, done: Done) -> None:
-        self.files = done.files
         for path in done.files:
-            item = QListWidgetItem(path.name)
-            item.setToolTip(str(path))
-            item.setData(Qt.ItemDataRole.UserRole, path)
-            self.list.addItem(item)
             self.session.log("info", f"Wrote {path}")
         if done.kept:
             self._told(Told("warn", done.kept))
         elif not done.good:
-            mark(self.words, "refused", True)
+            self.found.mark_wrong(True)
         page = self._pages[self._running]
         if (
             page.names is not None
@@ -406,25 +346,18 @@ class TasksPanel(Panel):
         ):
             # What was interrupted, and a chart that has more to do, is gone on with under the same name.
             page.names.suggest(re.sub(r"-\d+$", "", self._out.name.partition(".")[0]))
-        self.below.setVisible(bool(done.files))
-        self.folder_button.setEnabled(bool(done.files))
-        self.use_button.setEnabled(any(map(self._panel_for, done.files)))
+        self.found.show_files(done.files, usable=any(map(self._panel_for, done.files)))
         self.run_bar.show_end("Ended early" if done.kept else "Done", complete=not done.kept)
-        pictures = [path for path in done.files if path.suffix in _PICTURES]
-        previews = [
-            path for path in pictures if path.stem.endswith("-preview")
-        ]  # of a pattern that says little
-        if pictures:
-            self._show([*previews, *pictures][0])
 
     def _failed(self, why: str) -> None:
+        self._refused = True
         self._ended(self._pages[self._running].form.in_its_words(in_the_window(why)), wrong=True)
 
     def _ended(self, words: str, *, wrong: bool = False) -> None:
-        self.words.appendPlainText(words)
-        self.words.show()
-        mark(self.words, "refused", wrong)  # a deliberate end is no error
-        self.run_bar.show_end(words.splitlines()[0], complete=False)
+        self.found.say(words)
+        self.found.mark_wrong(wrong)  # a deliberate end is no error
+        first, _, more = words.splitlines()[0].partition(". ")
+        self.run_bar.show_end(f"{first}." if more else first, complete=False)
 
     def _over(self) -> None:
         words = self.run_bar.words.text()
@@ -434,15 +367,6 @@ class TasksPanel(Panel):
         self.choice.setEnabled(True)
 
     # Results -------------------------------------------------------------------------------------
-    def _show(self, path: Path) -> None:
-        if path.suffix in _PICTURES:
-            seen = orientation_of(self.session, "results")
-            self._reader.ask(lambda: read_turned(path, seen), self._show_picture)
-
-    def _show_picture(self, picture: QImage) -> None:
-        self.picture.show_pixmap(QPixmap.fromImage(picture))
-        self.results.setCurrentWidget(self.picture)
-
     def _panel_for(self, path: Path) -> str:
         """Return the name of the panel that works with a result; empty where there is none."""
         if path.name in ("chart.json", "stability.json"):
@@ -469,23 +393,16 @@ class TasksPanel(Panel):
     def _open_result(self, path: Path) -> None:
         """Open a file in the panel that works with it, else as the desktop does."""
         if not self._hand_on(path):
-            self._open(path)
-
-    def _open(self, path: Path) -> None:
-        QDesktopServices.openUrl(QUrl.fromLocalFile(str(path)))
-
-    def _open_folder(self) -> None:
-        if self.files:
-            self._open(self.files[0].parent)
+            self.found.open_as_desktop(path)
 
     def _use(self) -> None:
-        any(map(self._hand_on, self.files))  # the first that a panel works with
+        any(map(self._hand_on, self.found.files))  # the first that a panel works with
 
     def shutdown(self) -> None:
         """End the task."""
         super().shutdown()
         self.run.abort()
-        for each in (self._loader, self._reader, self._newest):
+        for each in (self._loader, self.found, self._newest):
             each.forget()
 
 

@@ -22,6 +22,9 @@ from PySide6.QtWidgets import (
 from gui.theme import dress
 from gui.widgets.building import button, fill, text_view
 
+IMAGES = "Images (*.tif *.tiff *.png *.jpg *.jpeg *.bmp *.npy *.npz *.h5 *.hdf5 *.mat);;All files (*)"
+"""What of PSFs and photographs can be read; a folder of pictures, or an OME-Zarr, is typed."""
+
 Browse = Literal["open", "folder", "save"]
 
 

@@ -1,4 +1,4 @@
-"""A sweep on the screen: its planned path, the quality of each PSF, their pictures, the routine's picture."""
+"""A sweep on the screen: its planned path, the quality of each PSF, their pictures."""
 
 from __future__ import annotations
 
@@ -9,13 +9,12 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 import pyqtgraph as pg
-from PySide6.QtCore import QRectF, Qt, Signal
-from PySide6.QtGui import QColor, QImage, QPainter, QPaintEvent, QPixmap
+from PySide6.QtCore import Qt, Signal
 from PySide6.QtWidgets import QHBoxLayout, QSizePolicy, QWidget
 
 from calibration_routines.psf.psf_quality import MIN_SNR, PsfQuality
 from calibration_routines.psf.sweep_watch import PointTaken
-from gui.theme import LARGE_PT, colours, spares_hues
+from gui.theme import colours
 from gui.widgets.building import cell, fill, hint, split, table
 from gui.widgets.plots import dots, plot_widget
 
@@ -58,6 +57,7 @@ class PathPlot(QWidget):
     def show_path(self, places: Sequence[Place]) -> None:
         """Draw a path; an empty one says that nothing moves."""
         places = tuple(places)
+        self.nothing.setText("Nothing moves." if not places else "The source goes to one place and stays.")
         if places == self.places:
             return
         self.places = places
@@ -68,7 +68,6 @@ class PathPlot(QWidget):
         for view in self._made:
             view.plot.setVisible(view in self.views)
         self.nothing.setVisible(not self.views)
-        self.nothing.setText("Nothing moves." if not places else "The source goes to one place and stays.")
         for view in self.views:
             view.draw(places)
 
@@ -301,62 +300,3 @@ def small(image: Image) -> PsfPicture:
     low, high = np.percentile(means, _LEVELS)
     stretched = (means - low) * (255 / max(high - low, 1.0))
     return PsfPicture(np.clip(np.rint(stretched), 0, 255).astype(np.uint8), factor)
-
-
-NO_PICTURE = "No picture yet."
-
-
-_PAPER_IN_RED = QColor(150, 0, 0)
-"""Darker than STOP."""
-
-
-class Picture(QWidget):
-    """Shows a pixmap, scaled down or up to the space there is."""
-
-    def __init__(self, parent: QWidget | None = None) -> None:
-        super().__init__(parent)
-        self.pixmap = QPixmap()
-        self._grey: QPixmap | None = None
-        self._empty = NO_PICTURE
-        self.setMinimumSize(160, 120)
-        self.setSizePolicy(QSizePolicy.Policy.Expanding, QSizePolicy.Policy.Expanding)
-
-    def show_pixmap(self, pixmap: QPixmap) -> None:
-        """Show a picture; an empty one shows nothing."""
-        self.pixmap, self._grey = pixmap, None
-        self.update()
-
-    def _in_grey(self) -> QPixmap:
-        """Return the picture without its hues, made once."""
-        if self._grey is None:
-            grey = self.pixmap.toImage().convertToFormat(QImage.Format.Format_Grayscale8)
-            self._grey = QPixmap.fromImage(grey)
-        return self._grey
-
-    def clear(self, why: str = NO_PICTURE) -> None:
-        """Show nothing but words."""
-        self._empty = why
-        self.show_pixmap(QPixmap())
-
-    def paintEvent(self, _event: QPaintEvent) -> None:  # noqa: N802 - Qt's name
-        """Draw the picture, or say that there is none."""
-        if self.pixmap.isNull():
-            painter = QPainter(self)
-            painter.setPen(QColor(colours().dim))
-            font = self.font()
-            font.setPointSize(LARGE_PT)
-            painter.setFont(font)
-            painter.drawText(self.rect(), Qt.AlignmentFlag.AlignCenter, self._empty)
-            painter.end()
-            return
-        size = self.pixmap.size().scaled(self.size(), Qt.AspectRatioMode.KeepAspectRatio)
-        left, top = (self.width() - size.width()) / 2, (self.height() - size.height()) / 2
-        painter = QPainter(self)
-        painter.setRenderHint(QPainter.RenderHint.SmoothPixmapTransform)
-        red = spares_hues(colours().colour_map)  # a page is white
-        place, shown = QRectF(left, top, size.width(), size.height()), self._in_grey() if red else self.pixmap
-        painter.drawPixmap(place, shown, QRectF(shown.rect()))
-        if red:
-            painter.setCompositionMode(QPainter.CompositionMode.CompositionMode_Multiply)
-            painter.fillRect(place, _PAPER_IN_RED)
-        painter.end()

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from itertools import pairwise
 
 from PySide6.QtCore import Qt
@@ -30,6 +30,17 @@ def tab_in_order(root: QWidget, *, after: QWidget | None = None) -> None:
     stops = [part for part in _in_order(root) if part.focusPolicy() & Qt.FocusPolicy.TabFocus]
     for earlier, later in pairwise(stops if after is None else [after, *stops]):
         QWidget.setTabOrder(earlier, later)
+
+
+def take_turns(on: Sequence[QWidget], off: Sequence[QWidget]) -> None:
+    """Enable some buttons and disable others; the keyboard goes with the work, not to wherever Qt goes on."""
+    had_it = any(part.hasFocus() for part in off)
+    for part in on:
+        part.setEnabled(True)
+    if had_it and on:
+        on[0].setFocus()
+    for part in off:
+        part.setEnabled(False)
 
 
 def stops_of(window: QWidget) -> Iterator[QWidget]:

@@ -9,7 +9,8 @@ from pytestqt.qtbot import QtBot
 
 from gui.theme import RED
 from gui.widgets.image_view import usual_levels
-from gui.widgets.sweep_views import Picture, PsfPictures, PsfTable, small
+from gui.widgets.picture import Picture
+from gui.widgets.sweep_views import PathPlot, PsfPictures, PsfTable, small
 
 
 def test_a_long_sweep_stays_small_and_every_psf_can_be_looked_at() -> None:
@@ -80,7 +81,16 @@ def test_a_page_is_red_and_darker_than_stop_in_the_dark_room(
     picture.resize(160, 120)
     picture.show_pixmap(page)
     assert picture.grab().toImage().pixelColor(80, 60) == QColor("white")
-    monkeypatch.setattr("gui.widgets.sweep_views.colours", lambda: RED)
+    monkeypatch.setattr("gui.widgets.picture.colours", lambda: RED)
     seen = picture.grab().toImage().pixelColor(80, 60)
     assert (seen.green(), seen.blue()) == (0, 0)
     assert 100 < seen.red() < QColor(RED.error).red()
+
+
+def test_a_plan_that_moves_nothing_is_not_said_to_be_impossible(qtbot: QtBot) -> None:
+    path = PathPlot()
+    qtbot.addWidget(path)
+    list(path.parts())
+    path.clear("No path: this cannot be carried out as it stands.")
+    path.show_path(())  # of what is typed then
+    assert path.nothing.text() == "Nothing moves."

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from PIL import Image
 from PySide6.QtCore import Qt
-from PySide6.QtGui import QImage
+from PySide6.QtGui import QImage, QPixmap
 from PySide6.QtWidgets import QTableWidget, QWidget
 from pytestqt.qtbot import QtBot
 
@@ -21,6 +21,7 @@ from gui.panel import whole
 from gui.panels.tasks import TasksPanel
 from gui.session import BenchSession
 from gui.session_news import OwnFiles
+from gui.widgets.picture import LargePicture
 from gui.widgets.tab_order import stops_of
 from instrument.files.calibration_file import save_calibration
 from instrument.files.images import write_image
@@ -147,18 +148,18 @@ def test_what_was_found_comes_to_the_front_and_a_picture_when_there_is_one(
     shown(qtbot, panel, "compare", old=old, new=new, figure=tmp_path / "page.png")
     with qtbot.waitSignal(panel.run.over, timeout=WAIT_MS):
         panel.start()
-    qtbot.waitUntil(lambda: panel.results.currentWidget() is panel.picture, timeout=WAIT_MS)
+    qtbot.waitUntil(lambda: panel.found.results.currentWidget() is panel.found.picture, timeout=WAIT_MS)
     go = threading.Event()
     late = QImage(str(tmp_path / "page.png"))
-    panel._reader.ask(lambda: late if go.wait(WAIT_MS / 1000) else None, panel._show_picture)
+    panel.found._reader.ask(lambda: late if go.wait(WAIT_MS / 1000) else None, panel.found._show_picture)
     shown(qtbot, panel, "etendue")
     go.set()
-    qtbot.waitUntil(lambda: not panel._reader.is_reading, timeout=WAIT_MS)
-    assert panel.picture.pixmap.isNull(), "a picture of the task before"
+    qtbot.waitUntil(lambda: not panel.found._reader.is_reading, timeout=WAIT_MS)
+    assert panel.found.picture.pixmap.isNull(), "a picture of the task before"
     with qtbot.waitSignal(panel.run.over, timeout=WAIT_MS):
         panel.start()
-    assert panel.results.currentIndex() == 0, "its table, and no place for a picture that there is not"
-    assert panel._tables.count()
+    assert panel.found.results.currentIndex() == 0, "its table, and no place for a picture that there is not"
+    assert panel.found._tables.count()
 
 
 def test_forms_begin_with_the_newest_calibration_and_a_place_for_the_result(
@@ -197,12 +198,12 @@ def test_a_hologram_of_spots_is_previewed_and_goes_on_to_the_slm(qtbot: QtBot, p
     with qtbot.waitSignal(panel.run.over, timeout=WAIT_MS):
         panel.start()
     pattern = panel.session.runs_folder / "results" / "slm.png"
-    assert panel.files[0] == pattern, panel.words.toPlainText()
+    assert panel.found.files[0] == pattern, panel.found.words.toPlainText()
     handed: list[object] = []
     panel.session.handed_on.connect(lambda *what: handed.extend(what))
-    qtbot.mouseClick(panel.use_button, Qt.MouseButton.LeftButton)
+    qtbot.mouseClick(panel.found.use_button, Qt.MouseButton.LeftButton)
     assert handed == ["slm", pattern]
-    panel.list.itemActivated.emit(panel.list.item(0))
+    panel.found.list.itemActivated.emit(panel.found.list.item(0))
     assert handed == ["slm", pattern] * 2
 
 
@@ -213,10 +214,10 @@ def test_a_film_that_is_imported_goes_on_to_films(qtbot: QtBot, panel: TasksPane
     with qtbot.waitSignal(panel.run.over, timeout=WAIT_MS):
         panel.start()
     (made,) = (tmp_path / "mine").iterdir()
-    assert panel.files == (made,), panel.words.toPlainText()
+    assert panel.found.files == (made,), panel.found.words.toPlainText()
     handed: list[object] = []
     panel.session.handed_on.connect(lambda *what: handed.extend(what))
-    qtbot.mouseClick(panel.use_button, Qt.MouseButton.LeftButton)
+    qtbot.mouseClick(panel.found.use_button, Qt.MouseButton.LeftButton)
     assert handed == ["films", made]
 
 
@@ -227,22 +228,22 @@ def test_two_calibrations_are_compared_with_table_and_python_beside_the_form(
     shown(qtbot, panel, "compare", old=old, new=new, out=tmp_path / "found.json")
     with qtbot.waitSignal(panel.run.over, timeout=WAIT_MS):
         panel.start()
-    assert "RECALIBRATE" in panel.words.toPlainText()
-    assert panel.words.property("refused")  # seen without being read
-    assert panel._tables.count() == 1
-    assert panel.files == (tmp_path / "found.json",)
+    assert "RECALIBRATE" in panel.found.words.toPlainText()
+    assert panel.found.words.property("refused")  # seen without being read
+    assert panel.found._tables.count() == 1
+    assert panel.found.files == (tmp_path / "found.json",)
     exec(panel.as_python().replace("found.json", "again.json"), {})
     assert (tmp_path / "again.json").read_bytes() == (tmp_path / "found.json").read_bytes()
     assert "RECALIBRATE" in capsys.readouterr().out
     with qtbot.waitSignal(panel.run.over, timeout=WAIT_MS):
         panel.start()  # the file is there now
-    assert "exists" in panel.words.toPlainText()
-    assert not panel.files
+    assert "exists" in panel.found.words.toPlainText()
+    assert not panel.found.files
     assert panel.run_bar.words.text()
     shown(qtbot, panel, "refocus")
     qtbot.waitUntil(lambda: not panel.run_bar.words.text(), timeout=WAIT_MS)  # it was another task's
-    assert not panel.words.toPlainText()  # and so was what it found
-    assert not panel._tables.count()
+    assert not panel.found.words.toPlainText()  # and so was what it found
+    assert not panel.found._tables.count()
 
 
 @pytest.mark.parametrize("name", ["video", "patterned", "activity"])
@@ -268,7 +269,7 @@ def test_a_picture_in_patterned_light_is_opened_as_a_result(
     panel._succeeded(Done((panel._out, tmp_path / "patterned.json")))
     handed: list[object] = []
     panel.session.handed_on.connect(lambda *what: handed.extend(what))
-    qtbot.mouseClick(panel.use_button, Qt.MouseButton.LeftButton)
+    qtbot.mouseClick(panel.found.use_button, Qt.MouseButton.LeftButton)
     assert handed == ["reconstructions", OwnFiles(result=panel._out)]
 
 
@@ -310,7 +311,7 @@ def test_a_task_waits_ends_and_keeps_what_it_can(qtbot: QtBot, panel: TasksPanel
         assert "ENDING" in panel.run_bar.words.text()
         run.abort()
         run.pause()  # of what is ended: it does not wait
-    assert not panel.words.property("refused"), "a deliberate end is no error"
+    assert not panel.found.words.property("refused"), "a deliberate end is no error"
     assert issubclass(JobCancelledError, KeyboardInterrupt)  # what a task in the terminal sees
 
 
@@ -322,7 +323,7 @@ def test_the_field_of_view_is_told_in_a_table_that_fits_a_small_screen(
     shown(qtbot, panel, "etendue")
     with qtbot.waitSignal(panel.run.over, timeout=WAIT_MS):
         panel.start()
-    (table,) = panel.tables.findChildren(QTableWidget)
+    (table,) = panel.found.tables.findChildren(QTableWidget)
     assert table.columnCount() == 6
     form_px = panel.stack.width()
     qtbot.waitUntil(lambda: table.isVisible() and not table.horizontalScrollBar().maximum(), timeout=WAIT_MS)
@@ -344,3 +345,70 @@ def test_a_border_that_was_moved_stays_where_it_was_put(qtbot: QtBot, panel: Tas
     put = across.sizes()
     shown(qtbot, panel, "spots")
     assert across.sizes() == put
+
+
+def test_an_error_goes_when_a_field_is_mended_and_moves_no_button(qtbot: QtBot, panel: TasksPanel) -> None:
+    panel.resize(860, 600)
+    panel.show()
+    shown(qtbot, panel, "stability", names=("lihgt",))
+    start = panel.run_bar.start_button
+    place = start.mapTo(panel, start.rect().topLeft())
+    with qtbot.waitSignal(panel.run.over, timeout=WAIT_MS):
+        qtbot.mouseClick(start, Qt.MouseButton.LeftButton)
+    assert "Did you mean 'light'?" in panel.found.words.toPlainText()
+    assert panel.found.words.property("refused")
+    assert panel.run_bar.words.text() == "There is no map 'lihgt'.", "all of it stands beside the form"
+    qtbot.wait(20)
+    assert start.mapTo(panel, start.rect().topLeft()) == place, "who presses it again must not miss it"
+    field: Any = panel._pages["stability"].form.widgets["names"]
+    field.setFocus()
+    field.selectAll()
+    qtbot.keyClicks(field, "light")
+    qtbot.keyClick(field, Qt.Key.Key_Tab)
+    assert not panel.found.words.property("refused")
+    assert not panel.found.words.toPlainText()
+    assert not panel.run_bar.words.text()
+
+
+def test_the_keyboard_stays_where_the_work_is(qtbot: QtBot, panel: TasksPanel) -> None:
+    panel.show()
+    panel.activateWindow()
+    shown(qtbot, panel, "verify")
+    bar = panel.run_bar
+    bar.start_button.setFocus()
+    qtbot.waitUntil(bar.start_button.hasFocus, timeout=WAIT_MS)
+    bar.set_running(True)
+    assert bar.pause_button.hasFocus()
+    bar.abort_button.setFocus()
+    bar.set_running(False)
+    assert bar.start_button.hasFocus(), "it went to wherever Tab goes on from a button that is off"
+
+
+def test_a_picture_takes_of_the_forms_width_and_is_shown_larger(
+    qtbot: QtBot, panel: TasksPanel, tmp_path: Path
+) -> None:
+    panel.resize(SIZES["1366x768"].width() - 480, 600)
+    panel.show()
+    shown(qtbot, panel, "optics")
+    form_px, chart = panel.stack.width(), tmp_path / "optics.png"
+    write_image(chart, np.full((600, 700, 3), 200, np.uint8))
+    panel._succeeded(Done((chart,)))
+    picture = panel.found.picture
+    qtbot.waitUntil(lambda: not picture.pixmap.isNull() and panel.stack.width() < form_px, timeout=WAIT_MS)
+    shown(qtbot, panel, "refocus")
+    assert panel.stack.width() == form_px
+    assert picture.show_larger() is None, "there is none"
+
+    picture.show_pixmap(QPixmap(1400, 1300))
+    panel.found.results.setCurrentWidget(picture)
+    for opens in (
+        lambda: qtbot.mouseClick(picture, Qt.MouseButton.LeftButton),
+        lambda: qtbot.keyClick(picture, Qt.Key.Key_Return),
+    ):
+        opens()
+        (window,) = picture.findChildren(LargePicture)
+        assert not window.isModal(), "STOP takes clicks beside it"
+        assert window.picture.width() > picture.width()
+        assert window.picture.show_larger() is None
+        window.reject()
+        qtbot.waitUntil(lambda: not picture.findChildren(LargePicture), timeout=WAIT_MS)
