@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from datetime import datetime
+from collections.abc import Iterable, Iterator, Sequence
 from functools import partial
 from html import escape
 from pathlib import Path
@@ -11,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 from PySide6.QtCore import Qt
-from PySide6.QtWidgets import QListWidget, QListWidgetItem, QStackedWidget, QTabWidget, QWidget
+from PySide6.QtWidgets import QStackedWidget, QTabWidget, QWidget
 
 from calibration_routines.psf.sweep_plan import SWEEP
 from gui.background import NewestOnly
@@ -32,13 +31,12 @@ from gui.result_export import ResultExport
 from gui.session import BenchSession
 from gui.session_news import OwnFiles
 from gui.theme import as_shown
-from gui.widgets.building import Hint, button, fill, hint, in_row, label, split
-from gui.widgets.dialogues import choose_path
+from gui.widgets.building import Hint, button, fill, in_row, label, split
 from gui.widgets.result_views import ConvergenceView, FactsView, PictureView
+from gui.widgets.results_list import ResultsList
 from gui.widgets.volume_view import VolumeView
 from instrument.files.calibration_file import calibrated_depths_um, find_calibration, newest_calibration
 from instrument.files.errors import BenchError, FileError
-from instrument.files.results import find_results
 from instrument.reconstruction.request import VolumeRequest
 from instrument.reconstruction.stored_result import StoredResult, open_result
 from recon.base.as_python import Imports, expression
@@ -48,6 +46,7 @@ from recon.reconstruction.options import ReconstructionOptions
 _NOTHING_OPEN = "Nothing is open: choose a result on the left, or reconstruct a photograph."
 _FORM_OPEN = "Nothing is open: fill in the form on the left, then press Reconstruct."
 _AS_IT_STANDS = "as it stands would be reconstructed like this:"
+_COMES = "The first picture is being computed …"
 _REFINABLE = "--refine-psf fits"
 """In the verdict's sentence, where fitting the PSF to the photograph is what helps."""
 
@@ -83,23 +82,13 @@ class ReconstructionsPanel(Panel):
         right.setStretchFactor(0, 3)
         fill(self.body, split(self.tabs, right, sizes=[380, 840], stretch=1))
         yield
-        self.list = QListWidget()
-        self.list.setAccessibleName("Reconstructions")
-        self.list.setToolTip("Reconstructions in the data folder, the newest first (Enter opens)")
-        self.list.setAlternatingRowColors(True)
-        self.list.itemActivated.connect(self._open_item)
-        self.list.itemClicked.connect(self._open_item)
-        tip = "Open any picture or volume: TIFF, OME-Zarr, .npy, or a record"
-        self.open_button = button("Open…", tip, self._choose)
-        self.refresh_button = button("Refresh", "Look into the data folder again", self.refresh)
+        self.results = ResultsList(self.jobs, session.runs_folder)
+        self.results.chosen.connect(self.open)
+        self.results.failed.connect(lambda why: self.refused(None, why))
+        self.tabs.addTab(self.results, "Results")
+        yield
         tip = "Write all values (.tif, .npy, .ome.zarr), or what is shown (.png)"
         self.export_button = button("Export…", tip, lambda: self.export.choose(), enabled=False)
-        buttons = in_row(self.open_button, self.refresh_button)
-        self.none = hint("No reconstruction is in the data folder yet.")
-        self.none.hide()
-        listed = fill(QWidget(), (self.none, 1), (self.list, 1), buttons, margins=(0, 6, 0, 0))
-        self.tabs.addTab(listed, "Results")
-        yield
         tip = "The PSF is turned or of another size for this photograph: fit it first, then reconstruct again"
         self.refine_button = button("Fit the PSF, and again", tip, self.refine)
         self.refine_button.hide()
@@ -146,7 +135,7 @@ class ReconstructionsPanel(Panel):
         below.addWidget(self.convergence)
         below.setSizes([330, 330])
         yield
-        session.run_finished.connect(lambda _: self.refresh())
+        session.run_finished.connect(lambda _: self.results.refresh())
         session.kept_changed.connect(self._say_what_is_shown)
         folder = self.session.runs_folder / "reconstructions"
         self._names = SuggestedName(self.jobs, self.form.options, folder, ".tif")
@@ -154,7 +143,7 @@ class ReconstructionsPanel(Panel):
         self._depths = NewestOnly(self.jobs, "Reading a calibration's depths")
         self._newest = NewestOnly(self.jobs, "Looking for the newest calibration")
         self.form.options.settled.connect(self._settled)
-        self.refresh()
+        self.results.refresh()
 
     @property
     def options_form(self) -> OptionsForm:
@@ -166,29 +155,6 @@ class ReconstructionsPanel(Panel):
         return self.form.options.wholes()
 
     # Results -------------------------------------------------------------------------------------
-    def refresh(self) -> None:
-        """List the results in the data folder."""
-        folder = self.session.runs_folder
-        look = self.jobs.watch("Looking for results", lambda _: [(p, _age(p)) for p in find_results(folder)])
-        self.follow(look).succeeded.connect(self._list)
-
-    def _list(self, records: list[tuple[Path, str]]) -> None:
-        self.list.clear()
-        self.none.setVisible(not records)
-        self.list.setVisible(bool(records))
-        for record, changed in records:
-            item = QListWidgetItem(f"{record.stem}\n    {changed}  {record.parent.name}")
-            item.setToolTip(str(record))
-            item.setData(Qt.ItemDataRole.UserRole, record)
-            self.list.addItem(item)
-
-    def _open_item(self, item: QListWidgetItem) -> None:
-        self.open(item.data(Qt.ItemDataRole.UserRole))
-
-    def _choose(self) -> None:
-        filters = "Results (*.tif *.tiff *.npy *.json)"
-        choose_path(self.list, "open", "Open a result", str(self.session.runs_folder), self.open, filters)
-
     def open(self, path: Path) -> Job:
         """Open a result, in a job; it is shown when it is there, or the last line says why not."""
         job = self.follow(self.jobs.compute(f"Opening {path.name}", lambda _: open_result(path)))
@@ -230,13 +196,19 @@ class ReconstructionsPanel(Panel):
         """Show what is known of the result that is shown; above it what is said of the form, if anything."""
         result = self.result
         if result is None:
-            self.facts.show_facts(explained)
+            self._tell(explained)
             return
-        warnings = [self.in_its_words(warning) for warning in result.warnings]
-        facts = [(name, self.in_its_words(value)) for name, value in result.facts()]
+        facts = list(result.facts())
         if explained:
             facts = [("The form", _AS_IT_STANDS), *explained, ("The picture", result.path.name), *facts]
-        self.facts.show_facts(facts, warnings, simulated=result.simulated)
+        self._tell(facts, result.warnings, simulated=result.simulated)
+
+    def _tell(
+        self, facts: Iterable[tuple[str, str]], warnings: Iterable[str] = (), *, simulated: bool = False
+    ) -> None:
+        """Show facts and warnings, which name options of the terminal, as the form has those."""
+        said = [(name, self.in_its_words(value)) for name, value in facts]
+        self.facts.show_facts(said, [self.in_its_words(text) for text in warnings], simulated=simulated)
 
     def _say_what_is_shown(self) -> None:
         """Say over a result when its photograph was taken and in which light, and how it is turned."""
@@ -387,7 +359,7 @@ class ReconstructionsPanel(Panel):
             facts.append((decision.name.capitalize(), f"{decision.value}: {decision.why}"))
             steps = (("up", decision.up), ("down", decision.down))
             facts += [("", f"one step {way}: {option}") for way, option in steps if option is not None]
-        self._show_facts([(name, self.in_its_words(words)) for name, words in facts])
+        self._show_facts(facts)
         why = "; what was chosen, and why, is below the picture" if explained.decisions else ""
         takes = "Trying what it takes …" if explained.takes is None else f"Will take {explained.takes}"
         self.form.show_progress(0.0, f"{takes}{why}.")
@@ -406,9 +378,9 @@ class ReconstructionsPanel(Panel):
             return  # another result is looked at meanwhile
         prepared = so_far.prepared
         if so_far.image is None:
-            self.facts.show_facts(
-                list(prepared.notes.items()), prepared.warnings, simulated=prepared.simulated
-            )
+            self._tell(prepared.notes.items(), prepared.warnings, simulated=prepared.simulated)
+            if self.viewers.currentWidget() is self.empty:
+                self.empty.say(_COMES, busy=True)
             return
         keep = not self._first_picture
         # The first ones may be empty yet: no levels for those that follow.
@@ -429,7 +401,7 @@ class ReconstructionsPanel(Panel):
         self.session.log("info", f"Reconstructed: {path}")
         self._suggest_out()
         self.open(path)
-        self.refresh()
+        self.results.refresh()
 
     # The panel -----------------------------------------------------------------------------------
     def take(self, what: Path | OwnFiles) -> None:
@@ -494,14 +466,6 @@ class ReconstructionsPanel(Panel):
         self._depths.forget()
         self._newest.forget()
         self._close_result()
-
-
-def _age(record: Path) -> str:
-    """Return when a record was written; nothing for one that is gone by now."""
-    try:
-        return datetime.fromtimestamp(record.stat().st_mtime).strftime("%Y-%m-%d %H:%M")
-    except OSError:
-        return ""
 
 
 def _depths_of(path: Path) -> tuple[float, ...]:

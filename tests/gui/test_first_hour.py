@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from PySide6.QtCore import QSettings, Qt
-from PySide6.QtWidgets import QFileDialog, QLineEdit
+from PySide6.QtWidgets import QApplication, QFileDialog, QLineEdit, QWidget
 from pytestqt.qtbot import QtBot
 
 from drivers.device import FoundDevice
@@ -22,6 +22,7 @@ from gui.panels.start import StartPanel
 from gui.panels.unserved import UnservedPanel, why_not
 from gui.session import BenchSession
 from gui.widgets.dialogues import TextWindow
+from gui.widgets.tab_order import stops_of
 from instrument.bench.config import BenchConfig
 from instrument.bench.config_file import TEMPLATES, no_bench, parse_config, template
 from instrument.files.images import write_image
@@ -88,6 +89,47 @@ def test_own_files_are_reconstructed_by_three_clicks_without_a_bench(
     assert panel.result is not None
     assert panel.result.path.is_relative_to(tmp_path / "runs")
     assert not list(tabbed(bare)), "without a bench the bar of docks that are hidden is no stop"
+
+
+def test_own_files_are_opened_reconstructed_and_saved_by_keys_alone(
+    qtbot: QtBot, bare: MainWindow, tmp_path: Path
+) -> None:
+    psf = (np.random.default_rng(3).random((40, 50)) > 0.98).astype(np.float32)
+    write_image(tmp_path / "point.tif", psf)
+    write_image(tmp_path / "photo.tif", np.roll(psf, (4, 5), (0, 1)))
+
+    def goes_to(part: QWidget) -> None:
+        """Press Tab until a part has the keyboard: as often as there are stops, at most."""
+        for _ in stops_of(bare):
+            if part.hasFocus():
+                return
+            qtbot.keyClick(QApplication.focusWidget() or bare, Qt.Key.Key_Tab)
+        raise AssertionError(f"Tab does not come to {part.accessibleName() or part.toolTip()}")
+
+    def types(path: Path) -> None:
+        """Type a path where the keyboard is in the dialogue that has just come, and press Return."""
+        qtbot.waitUntil(lambda: any(d.isVisible() for d in bare.findChildren(QFileDialog)), timeout=WAIT_MS)
+        (dialogue,) = (d for d in bare.findChildren(QFileDialog) if d.isVisible())
+        dialogue.activateWindow()
+        assert isinstance(dialogue.focusWidget(), QLineEdit), "one can type at once"
+        choose(qtbot, bare, path)
+        qtbot.waitUntil(lambda: not dialogue.isVisible(), timeout=WAIT_MS)
+        bare.activateWindow()
+
+    bare.activateWindow()
+    qtbot.waitUntil(bare.isActiveWindow, timeout=WAIT_MS)
+    card = start_of(bare).cards["files"]
+    goes_to(card)
+    qtbot.keyClick(card, Qt.Key.Key_Space)
+    types(tmp_path / "point.tif")
+    types(tmp_path / "photo.tif")
+    panel = bare.panel("reconstructions")
+    assert isinstance(panel, ReconstructionsPanel)
+    qtbot.waitUntil(lambda: panel.result is not None, timeout=WAIT_MS)
+    goes_to(panel.export_button)
+    qtbot.keyClick(panel.export_button, Qt.Key.Key_Space)
+    types(tmp_path / "saved.png")
+    qtbot.waitUntil((tmp_path / "saved.png").is_file, timeout=WAIT_MS)
 
 
 def test_each_simulated_bench_is_written_and_opened_from_the_start_page(

@@ -135,6 +135,19 @@ def test_a_picture_in_the_making_does_not_cover_a_result_that_was_opened_meanwhi
     assert "first.tif" in panel.heading.text()
 
 
+def test_what_is_known_of_a_picture_in_the_making_is_said_in_the_forms_words(
+    panel: ReconstructionsPanel,
+) -> None:
+    notes = {"Dark": "31.9 counts (estimated; a frame or counts may be given by --dark)"}
+    prepared = SimpleNamespace(notes=notes, warnings=("Try --erasures none.",), simulated=False)
+    panel._show_nothing("photo.tif is being read …", busy=True)
+    panel._progressed(SoFar(0.0, "Solving …", prepared), volume=False)
+    assert "--" not in panel.facts.toPlainText()
+    assert "may be given by “Dark”" in panel.facts.toPlainText()
+    assert "Try “Erasures” none." in panel.facts.toPlainText()
+    assert "being read" not in panel.empty.words.text()
+
+
 def test_levels_by_typing_and_automatic(qtbot: QtBot, panel: ReconstructionsPanel, tmp_path) -> None:
     write_image(tmp_path / "p.tif", np.linspace(0, 10, 400, dtype=np.float32).reshape(20, 20))
     panel.open(tmp_path / "p.tif")
@@ -216,7 +229,7 @@ def test_the_red_theme_shows_nothing_but_red(
 
 
 def test_what_is_empty_says_what_will_stand_there(qtbot: QtBot, panel: ReconstructionsPanel) -> None:
-    qtbot.waitUntil(panel.none.isVisible, timeout=WAIT_MS)
+    qtbot.waitUntil(panel.results.none.isVisible, timeout=WAIT_MS)
     assert not panel.convergence.plot.isVisible()  # an empty plot's numbers would mean nothing
     assert panel.convergence.legend.text() == "How it was solved is drawn here."
     assert not panel.facts.toPlainText()

@@ -98,7 +98,7 @@ def test_a_picture_by_mouse_is_written_and_shown(qtbot: QtBot, panel: Reconstruc
     assert "Photograph" in panel.facts.toPlainText()
     assert "residual / noise" in panel.convergence.curves
     assert "change" in panel.convergence.curves
-    qtbot.waitUntil(lambda: panel.list.count() == 1, timeout=WAIT_MS)
+    qtbot.waitUntil(lambda: panel.results.list.count() == 1, timeout=WAIT_MS)
     # The next one does not fall on top of it.
     qtbot.waitUntil(lambda: panel.form.text("out").endswith("photo-2.tif"), timeout=WAIT_MS)
 
