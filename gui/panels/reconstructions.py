@@ -27,13 +27,13 @@ from gui.forms.reconstruct import (
 )
 from gui.jobs import Job, JobContext
 from gui.panel import Panel
+from gui.panels.results_list import ResultsList
 from gui.result_export import ResultExport
 from gui.session import BenchSession
 from gui.session_news import OwnFiles
 from gui.theme import as_shown
 from gui.widgets.building import Hint, button, fill, in_row, label, split
 from gui.widgets.result_views import ConvergenceView, FactsView, PictureView
-from gui.widgets.results_list import ResultsList
 from gui.widgets.volume_view import VolumeView
 from instrument.files.calibration_file import calibrated_depths_um, find_calibration, newest_calibration
 from instrument.files.errors import BenchError, FileError

@@ -18,6 +18,7 @@ from gui.forms.form_stack import FormStack
 from gui.forms.options_form import OptionsForm, SuggestedName
 from gui.making import REST_MS, take_slice
 from gui.panel import Panel
+from gui.panels.found import FoundView
 from gui.procedure_run import RunBar
 from gui.session import BenchSession
 from gui.session_news import OwnFiles
@@ -29,7 +30,6 @@ from gui.widgets.building import (
     label,
     split,
 )
-from gui.widgets.found_view import FoundView
 from gui.widgets.orientation import orientation_of
 from gui.widgets.tab_order import tab_in_order
 from gui.words import in_the_window, level_of, with_signs
