@@ -144,6 +144,7 @@ def _prepare_camera(folder: Path) -> None:
         bench.write_text(fast.replace('scene = "beads"', f'scene = "{scene}"'))
         if not (folder / f"{scene}.tif").exists():
             _do("snap", "--bench", bench, "--exposure-ms", exposure_ms, "--out", folder / f"{scene}.tif")
+    bench.write_text(fast)
     if not list((folder / "runs").glob("*recording")):
         _do("record", "--bench", bench, "--frames", FILM_FRAMES, "--exposure-ms", 1)
     if not (folder / "chart" / "chart.json").exists():
@@ -302,8 +303,10 @@ def _analysis(window: MainWindow) -> None:
     calibration = sorted(panel.session.runs_folder.glob("*/calibration"))[0]
     panel.choose("analyze", calibration=calibration, points=False)
     _wait(lambda: panel.name == "analyze" and panel.run_bar.start_button.isEnabled(), "the form")
-    panel.start()
-    _wait(lambda: not panel.run.is_running, "the analysis")
+    over: list[bool] = []
+    panel.run.over.connect(lambda: over.append(True))
+    panel.start()  # which may wait for a name that no file has
+    _wait(lambda: bool(over), "the analysis")
 
 
 def _sweep(window: MainWindow) -> None:
