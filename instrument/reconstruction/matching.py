@@ -139,4 +139,8 @@ def matched_dark(
             f"{dark.reason} from the image, {float(np.mean(own.psf)):.4g} from the PSF (its darkest corner)"
         )
         dark = Dark(bin_image(dark.image, pair.image_binning), own.psf, words)
+    if isinstance(dark.psf, np.ndarray):
+        of_psf = dark.psf if dark.psf.ndim <= pair.psf.pixels.ndim else dark.psf.mean(axis=-1)
+        whole = of_psf.shape[:2] == psf.pixels.shape[:2]
+        dark = replace(dark, psf=bin_image(of_psf, pair.psf_binning) if whole else of_psf)
     return dark

@@ -18,6 +18,7 @@ from instrument.files.images import ImageFile, read_image
 from instrument.reconstruction.defects import defective_pixels, whole_lines
 from recon.base.blocks import block_mean
 from recon.base.checks import saturated_share
+from recon.base.sloping_light import rise_of, sloping_light
 from recon.errors import InputError
 from recon.types import Calibration
 
@@ -215,8 +216,21 @@ def dark_from_corners(psf: ImageFile, image: ImageFile) -> Dark:
     The PSF's darkest corner tells it (mean of 10 x 10 pixels, 5 from the border: light rarely reaches there);
     the image, whose corners are lit, has the same offset when both are raw frames of one camera
     (:func:`both_raw`). Otherwise the image's offset is the mean of its darkest 10 x 10 pixels. It is never
-    more than those, so that nothing is pushed below zero by an offset that the image does not have.
+    more than those, so that nothing is pushed below zero by an offset that the image does not have. Where the
+    PSF stands on light that grows across it, that is subtracted from it instead.
     """
+    dark = _of_corners(psf, image)
+    plane = sloping_light(psf.pixels)
+    if plane is None:
+        return dark
+    words = (
+        f"{dark.reason}; from the PSF light that grows across it by {rise_of(plane):.3g} counts, as its "
+        "border shows: take it in the dark"
+    )
+    return replace(dark, psf=plane, reason=words)
+
+
+def _of_corners(psf: ImageFile, image: ImageFile) -> Dark:
     corner, name = _darkest_corner(psf.pixels)
     darkest = darkest_block(image.pixels)
     if both_raw(psf, image):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 from typing import Any
 
@@ -125,6 +126,48 @@ def test_a_raw_frame_with_holes_is_raw_and_fractions_are_not() -> None:
 def test_a_float_psf_tells_nothing_about_the_images_offset() -> None:
     dark = dark_from_corners(file(psf_pixels("float32", 0) / 10), file(psf_pixels(offset=100)))
     assert (dark.image, dark.psf) == (100, 0)
+
+
+def caustics(shape: tuple[int, int] = (120, 160)) -> npt.NDArray[Any]:
+    """A pattern of bright lines that fills its frame, counts."""
+    rng = np.random.default_rng(2)
+    return np.asarray(4000 * np.maximum(gaussian_filter(rng.standard_normal(shape), 3) * 10 - 1, 0))
+
+
+def in_the_middle(pattern: npt.NDArray[Any]) -> npt.NDArray[Any]:
+    return np.asarray(np.pad(pattern[30:90, 40:120], ((30, 30), (40, 40))))
+
+
+@pytest.mark.parametrize("times", [1, 2])
+@pytest.mark.parametrize("colours", [1, 3])
+def test_light_that_grows_across_a_psf_is_taken_off_it(times: int, colours: int) -> None:
+    rng = np.random.default_rng(3)
+    pattern = in_the_middle(caustics())
+    slope = 40 + np.add.outer(2 * np.arange(120), 5 * np.arange(160)) / 2
+    photograph = file(np.asarray(300 + 100 * rng.random((120 // times, 160 // times)), np.uint16))
+
+    def prepared(light: npt.NDArray[Any] | float) -> tuple[npt.NDArray[Any], str]:
+        psf = np.repeat((pattern + light)[..., None], colours, axis=-1).squeeze()
+        noise = 3 * rng.standard_normal(psf.shape)
+        job = job_from_files(
+            file(np.round(psf + noise).astype(np.uint16)), photograph, InputOptions(binning=2)
+        )
+        return job.calibration.psfs[0, 0], job.notes["Dark"]
+
+    (clean, no_word), (levelled, told) = prepared(40.0), prepared(slope)
+    assert np.abs(levelled - clean).mean() < 0.02 * clean.mean()
+    grown = re.search(r"light that grows across it by (\d+) counts", told)
+    assert grown is not None
+    assert abs(int(grown[1]) - 516) <= 3
+    assert "grows" not in no_word
+
+
+@pytest.mark.parametrize("window", [np.s_[:, :], np.s_[30:, 40:], np.s_[:90, 20:140]])
+def test_a_pattern_that_reaches_the_border_is_no_sloping_light(window: Any) -> None:
+    whole = np.pad(caustics(), 20)[20:, 20:]
+    brighter = whole * np.linspace(0.2, 1, whole.shape[1])
+    psf = np.ascontiguousarray(brighter[window]).astype(np.uint16)
+    assert isinstance(dark_from_corners(file(psf), file(psf)).psf, float)
 
 
 def test_an_image_darker_than_the_psfs_corners_keeps_its_own_offset() -> None:
