@@ -1,0 +1,109 @@
+"""The measured hand by other laboratories' habits, against a plain ADMM of who knows: for ``measured.py``."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from benchmarks.measured_blind import Case, dusty, on_a_slope, rows_of, window
+from benchmarks.measured_variants import FULL, columns, compressed, counts, light, middle
+
+Array = npt.NDArray[Any]
+
+
+def few_counts(raw: Array, share: float, dark: float = 30) -> Array:
+    """Return a photograph exposed too short: a share of the counts, with the camera's own noise of 2."""
+    noise = 2 * np.random.default_rng(7).standard_normal(raw.shape)
+    return counts(share * light(raw) + dark + noise)
+
+
+def over_exposed(raw: Array, share: float) -> Array:
+    """Return a frame in which a share of the lit pixels is at full scale."""
+    lit = light(raw)
+    top = np.percentile(lit[lit > 0.05 * lit.max()], 100 * (1 - share))
+    return counts(lit * FULL / top + 30)
+
+
+def speckled(raw: Array, spots: int) -> Array:
+    """Return a frame with dust on the sensor's glass in places."""
+    rng = np.random.default_rng(8)
+    for down, across in rng.random((spots, 2)):
+        raw = dusty(raw, down, across)
+    return raw
+
+
+def of_jpegs(raw: Array, frames: int = 4, quality: int = 85) -> Array:
+    """Return the mean of a camera's JPEGs."""
+    rng = np.random.default_rng(9)
+    taken = [
+        compressed(counts(raw + 200 * rng.standard_normal(raw.shape)), quality).astype(np.float32)
+        for _ in range(frames)
+    ]
+    return np.mean(taken, axis=0, dtype=np.float32)
+
+
+def balanced(raw: Array, gains: tuple[float, ...]) -> Array:
+    """Return a grey frame as colours that a white balance has scaled."""
+    return np.stack([counts(g * light(raw) + 30) for g in gains], axis=-1)
+
+
+def doubled(psf: Array, rows: int, columns: int, share: float) -> Array:
+    """Return a PSF of two sources, the second of a share of the first's light."""
+    second = np.roll(light(psf), (rows, columns), axis=(0, 1))
+    return counts((light(psf) + share * second) / (1 + share) + 30)
+
+
+def as_8_bits(raw: Array) -> Array:
+    """Return the upper byte."""
+    return (raw >> 8).astype(np.uint8)
+
+
+LABS: Mapping[str, Case] = {
+    "photograph 8 bits, PSF 16": Case(lambda p, y: (p, as_8_bits(y))),
+    "photograph 8 bits, PSF 16, `--mixed-depth`": Case(
+        lambda p, y: (p, as_8_bits(y)), {"allow_mixed_depth": True}
+    ),
+    "photograph: a hot column": Case(lambda p, y: (p, columns(y, FULL, (777,))), known=lambda p, y: (p, y)),
+    "photograph: a column 5 % too bright": Case(
+        lambda p, y: (p, counts(y + 0.05 * FULL * (np.arange(y.shape[1]) == 777))), known=lambda p, y: (p, y)
+    ),
+    "PSF: five spots of dust": Case(lambda p, y: (speckled(p, 5), y)),
+    "PSF over light that grows across, 2 %": Case(
+        lambda p, y: (on_a_slope(p, 0.02), y), known=lambda p, y: (p, y)
+    ),
+    "PSF the mean of four JPEGs": Case(lambda p, y: (of_jpegs(p), as_8_bits(y))),
+    "photograph of a hundredth of the counts": Case(lambda p, y: (p, few_counts(y, 0.01))),
+    "photograph of a thousandth of the counts": Case(lambda p, y: (p, few_counts(y, 0.001))),
+    "the same, of a dark level of 100": Case(
+        lambda p, y: (p, few_counts(y, 0.001, 100)), known=lambda p, y: (p, few_counts(y, 0.001))
+    ),
+    "PSF: 5 % of its lit pixels at full scale": Case(lambda p, y: (over_exposed(p, 0.05), y)),
+    "the same, `--allow-saturated`": Case(lambda p, y: (over_exposed(p, 0.05), y), {"allow_saturated": True}),
+    "photograph turned by 90 degrees": Case(lambda p, y: (p, np.rot90(y)), truth=np.rot90),
+    "photograph turned by 180 degrees": Case(
+        lambda p, y: (p, np.rot90(y, 2)), truth=lambda t: np.rot90(t, 2)
+    ),
+    "PSF of another gain and black level": Case(lambda p, y: (counts(0.3 * light(p) + 1000), y)),
+    "PSF: its middle 80 %": Case(lambda p, y: (window(p, 0.8), y)),
+    "PSF: its middle half, taken for a binned one": Case(lambda p, y: (middle(p), y), {"binning": 4}),
+    "photograph in white-balanced colours": Case(lambda p, y: (p, balanced(y, (0.9, 0.5, 0.7)))),
+    "both in colours, balanced otherwise": Case(
+        lambda p, y: (balanced(p, (0.9, 0.5, 0.7)), balanced(y, (0.5, 0.5, 0.9)))
+    ),
+    "PSF of two sources, 60 and 40 pixels apart, the second a third": Case(
+        lambda p, y: (doubled(p, 60, 40, 1 / 3), y), known=lambda p, y: (p, y)
+    ),
+    "PSF of two sources, 8 pixels apart": Case(
+        lambda p, y: (doubled(p, 0, 8, 1.0), y), known=lambda p, y: (p, y)
+    ),
+}
+"""By name."""
+
+
+def labs(_: Path) -> list[str]:
+    """Show what becomes of the hand by defaults and by the plain ADMM on what its owner would have mended."""
+    return rows_of(LABS)
