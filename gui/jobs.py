@@ -298,7 +298,9 @@ class JobRunner(QObject):
         """Ask every device job to end; those that wait end at once. For the window's thread."""
         for job in self.device_jobs:
             job.cancel()
-        waiting, self._waiting = self._waiting, []  # none of them begins when the one before it ends
+        waiting = [number for number in self._waiting if self._jobs[number].lanes]
+        # None of them begins when the one before it ends. What uses no device waits for its turn only.
+        self._waiting = [number for number in self._waiting if number not in waiting]
         for number in waiting:
             self._finish(number, "cancelled", JobCancelledError())
         for job in self.device_jobs:  # what an end has asked for

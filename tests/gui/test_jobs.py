@@ -186,6 +186,19 @@ def test_no_job_that_waits_begins_while_those_before_it_are_cancelled(qtbot: QtB
     assert begun == []
 
 
+def test_stop_leaves_what_uses_no_device_though_it_was_asked_for_just_now(
+    qtbot: QtBot, jobs: JobRunner
+) -> None:
+    """The opening of a panel, or a reconstruction, that a click began in the turn in which STOP is pressed."""
+    moved: list[str] = []
+    move = jobs.device("move", lambda _: moved.append("moved"), {"stage"})
+    opening, computing = jobs.watch("open", lambda _: "panel"), jobs.compute("solve", lambda _: "picture")
+    jobs.cancel_device_jobs()
+    qtbot.waitUntil(lambda: not jobs.jobs, timeout=WAIT_MS)
+    assert (move.state, moved) == (JobState.CANCELLED, [])
+    assert [job.state for job in (opening, computing)] == [JobState.SUCCEEDED] * 2
+
+
 def test_jobs_end_without_a_word_once_what_shows_them_is_gone(jobs: JobRunner, qtbot: QtBot) -> None:
     go_on = threading.Event()
     heard: list[object] = []
