@@ -88,7 +88,7 @@ class ProcedurePanel(Panel):
         self.use_button = button(self.use_words, tip, self._use)
         self.use_button.hide()
         tip = "A simulated bench that serves this routine, in the place of this one"
-        self.other_button = button("", tip, self._open_other)
+        self.other_button = button("Open another bench", tip, self._open_other)
         self.other_button.hide()
         self.way_on = WayOn(self.session, self)
         self.way_on.go_on.connect(self.resume)

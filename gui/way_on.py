@@ -30,7 +30,8 @@ class ReconnectButton(QPushButton):
     def __init__(
         self, session: BenchSession, kinds: Sequence[Kind], parent: QWidget, words: str = ""
     ) -> None:
-        super().__init__(words, parent)
+        super().__init__(words or "Reconnect", parent)
+        self.setToolTip("Open the devices that failed again")
         self._session, self._kinds, self._words = session, kinds, words
         self._failed: list[Kind] = []
         self.clicked.connect(self._reconnect)

@@ -157,11 +157,11 @@ class Hint(QWidget):
         super().__init__()
         self.words = hint(words)
         self.words.setContentsMargins(0, 0, 0, 0)
-        self.button = button(answer, words, lambda: clicked())
+        self.button = button(answer, words or answer, lambda: clicked())
         parts: list[Part] = [self.words, in_row(None, self.button, None)]
         self._buttons = [self.button]
         if other is not None:
-            self.other = button(other[0], words, lambda: other[1]())
+            self.other = button(other[0], words or other[0], lambda: other[1]())
             self.other.setFlat(True)
             self._buttons.append(self.other)
             parts.append(in_row(None, self.other, None))

@@ -67,7 +67,7 @@ class RecordBar(QWidget):
         self._taken: Path | None = None
         self.look_button = button("Look at it…", "Show the recording, as far as it came", self._look_at_it)
         self.look_button.hide()
-        self.rest_button = button("Go on with it", clicked=self._go_on)
+        self.rest_button = button("Go on with it", "Record what a recording lacks", self._go_on)
         self.rest_button.hide()
         tip = "Offer it no longer: what was taken is kept as it is"
         self.leave_button = button("Leave it", tip, self._leave)

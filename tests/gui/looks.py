@@ -14,6 +14,8 @@ from PySide6.QtWidgets import (
     QLabel,
     QLineEdit,
     QListView,
+    QMenu,
+    QMenuBar,
     QPlainTextEdit,
     QScrollArea,
     QSizePolicy,
@@ -96,13 +98,20 @@ def scrolled_twice(root: QWidget) -> Iterator[str]:
             yield f"{_where(place)}: is scrolled sideways"
 
 
-def nameless(root: QWidget) -> Iterator[str]:
-    """Yield what takes keys or clicks but has no name for a screen reader, or no way to it by keys."""
-    for part in _visible(root, *_WITH_KEYS):
+def nameless(root: QWidget, *, hidden: bool = False) -> Iterator[str]:
+    """Yield what takes keys or clicks but has no name for a screen reader, or no way to it by keys.
+
+    ``hidden``: also of what is not seen now.
+    """
+    every = (part for part in root.findChildren(QWidget) if isinstance(part, _WITH_KEYS))
+    for part in every if hidden else _visible(root, *_WITH_KEYS):
         if part.objectName().startswith("qt_"):
             continue  # Qt's own: corners of tables, buttons of tabs
-        if part.parentWidget() is not None and isinstance(part.parentWidget(), QTabBar | QComboBox):
+        holder = part.parentWidget()
+        if isinstance(holder, QTabBar | QComboBox | QLineEdit | QMenu | QMenuBar):
             continue
+        if holder is not None and holder.inherits("QComboBoxPrivateContainer"):
+            continue  # the list of a box that is closed
         interface = QAccessible.queryAccessibleInterface(part)
         # Of a list box Qt's interface says what is chosen; its label is told beside it.
         name = part.accessibleName() or interface.text(QAccessible.Text.Name)

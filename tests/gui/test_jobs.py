@@ -189,7 +189,7 @@ def test_no_job_that_waits_begins_while_those_before_it_are_cancelled(qtbot: QtB
 def test_stop_leaves_what_uses_no_device_though_it_was_asked_for_just_now(
     qtbot: QtBot, jobs: JobRunner
 ) -> None:
-    """The opening of a panel, or a reconstruction, that a click began in the turn in which STOP is pressed."""
+    """The opening of a panel, or a reconstruction, begun in the turn in which STOP is pressed."""
     moved: list[str] = []
     move = jobs.device("move", lambda _: moved.append("moved"), {"stage"})
     opening, computing = jobs.watch("open", lambda _: "panel"), jobs.compute("solve", lambda _: "picture")

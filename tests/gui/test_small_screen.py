@@ -12,9 +12,13 @@ from pytestqt.qtbot import QtBot
 from gui.main_window import MainWindow
 from gui.panels import PANELS
 from gui.panels.live import LivePanel
+from gui.panels.sweeps import SweepsPanel
+from gui.panels.tasks import TasksPanel
 from gui.session import BenchSession
 from gui.widgets.building import fill, label, scrolled
-from tests.gui.looks import SIZES, faults
+from instrument.tasks import TASKS
+from tests.gui.conftest import WAIT_MS
+from tests.gui.looks import SIZES, faults, nameless
 
 ROOM = QSize(1280, 720)
 
@@ -68,6 +72,25 @@ def test_nothing_is_cut_off_scrolled_twice_or_nameless_on_a_small_screen(
         small.show_panel(name)
         qtbot.wait(50)
         assert not faults(small), name
+
+
+def test_every_control_has_a_name_also_those_that_are_made_or_seen_later(
+    qtbot: QtBot, small: MainWindow
+) -> None:
+    for name in PANELS:
+        panel = small.show_panel(name)
+        if isinstance(panel, SweepsPanel):
+            stack, names = panel.views, [routine.name for routine in panel.routines]
+        elif isinstance(panel, TasksPanel):
+            stack, names = panel.stack, list(TASKS)
+        else:
+            stack, names = None, []
+        for number, each in enumerate(names):
+            panel.choice.setCurrentIndex(number)  # type: ignore[attr-defined]
+            assert stack is not None
+            qtbot.waitUntil(lambda stack=stack, each=each: stack.is_whole(each), timeout=WAIT_MS)  # type: ignore[misc]
+        found = sorted(set(nameless(small, hidden=True)))
+        assert not found, "\n".join(found)
 
 
 def test_faults_of_looks_are_found(qtbot: QtBot) -> None:
