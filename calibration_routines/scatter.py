@@ -30,6 +30,7 @@ TOLERATED = 0.02
 LARGEST_PX = 500_000
 """Larger images are binned before they are compared: a twentieth of a pixel is told still."""
 _LINEAR_PX = 0.4  # a picture moves so far as its gradient tells; beyond, it is registered
+_STRAIGHT_PX = 0.1  # up to which the gradient tells brightness, too, to a fifth of a percent
 _SLOPE = np.array([-1, 9, -45, 0, 45, -9, 1], np.float32) / 60
 """A derivative of sixth order: the usual one of second order takes fine structure for flatter than it is."""
 _UNLIKE = 0.3  # part of an image's contrast that a fit leaves: beyond, it is looked for elsewhere
@@ -103,7 +104,7 @@ def _compared(seen: Float, other: Float) -> tuple[Change, float]:
     """Return how images differ, and the part of the contrast that is left where they lie on one another."""
     found, left = _fitted(seen, other)
     if left <= _UNLIKE and found.shift_px <= _LINEAR_PX:
-        return found, left
+        return found if found.shift_px <= _STRAIGHT_PX else _levelled(found, seen, other), left
     far = register(seen, other)
     ways = far.rows, far.columns
     if not far.reliable:
@@ -118,7 +119,23 @@ def _compared(seen: Float, other: Float) -> tuple[Change, float]:
         found, left = _fitted(back[inner], other[inner])
         level = float(seen.sum(dtype=np.float64) / other.sum(dtype=np.float64))
         found = replace(found, brightness=level, ambient=0.0)
-    return replace(found, rows=found.rows + far.rows, columns=found.columns + far.columns), left
+    there = replace(found, rows=found.rows + far.rows, columns=found.columns + far.columns)
+    return there if left > _POOR else _levelled(there, seen, other), left
+
+
+def _levelled(found: Change, seen: Float, other: Float) -> Change:
+    """Return a change with brightness and other light of images that were both moved half the way.
+
+    One that is moved is blurred, and a way that a fit takes for straight is bent: of one image alone either
+    looks as if its light had gone and other light had come in.
+    """
+    ways = found.rows, found.columns
+    inner = tuple(slice(_rim(way, n), n - _rim(way, n)) for way, n in zip(ways, other.shape, strict=True))
+    back, there = (
+        moved(image, *(by * way / 2 for way in ways))[inner] for image, by in ((seen, -1), (other, 1))
+    )
+    level, _ = _fitted(back, there)
+    return replace(found, brightness=level.brightness, ambient=level.ambient)
 
 
 def _rim(way: float, side: int) -> int:

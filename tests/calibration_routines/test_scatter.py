@@ -9,11 +9,14 @@ from scipy import ndimage
 
 from calibration_routines.psf.stage_fit import judge_drift
 from calibration_routines.scatter import Scatter, compare, pooled, scatter_of, steadied
+from drivers.simulated.options import WorldOptions
+from drivers.simulated.world import SimulatedWorld
 
 RNG = np.random.default_rng(4)
 PATTERN = ndimage.gaussian_filter(np.maximum(RNG.normal(size=(80, 100)), 0), 0.9)
 PATTERN[:20] = PATTERN[:, :20] = 0
 PATTERN *= 200 / PATTERN.max()
+Z_UM = 94e3
 
 
 Frames = npt.NDArray[np.float32]
@@ -91,3 +94,25 @@ def test_structure_that_grain_hides_gets_its_place_or_none(contrast: float, told
         change = compare(one, other)
         assert change.shift_px < 0.3 if told else change.shift_px == np.inf
         assert change.brightness == pytest.approx(1, abs=0.01)
+
+
+@pytest.mark.parametrize("way", [(0.0, 0.3), (0.2, 0.7), (0.8, 0.8), (0.6, 3.25)])
+def test_a_picture_that_only_moved_is_as_bright_as_it_was_and_no_other_light_came(
+    way: tuple[float, float],
+) -> None:
+    """By moving one image alone, or not at all, up to 2.3 % of the light had become other light."""
+    fine = SimulatedWorld(WorldOptions(preset="tiny", time_scale=0.0))
+    pitch_um = 13.0 * Z_UM / fine.distance_um
+
+    def light(down: float, right: float) -> npt.NDArray[np.float64]:
+        psf = np.array(fine.psf((-right * pitch_um, -down * pitch_um, Z_UM), (0.0, 1.0, 0.0)))
+        return psf / psf.sum()
+
+    rng = np.random.default_rng(3)
+    one, other = light(0.0, 0.0), light(*way)
+    bright = 4 * 3000 / one.max()
+    seen = [(rng.poisson(bright * each) / 4).astype(np.float32) for each in (one, other)]
+    change = compare(seen[1], seen[0])
+    assert (change.rows, change.columns) == pytest.approx(way, abs=0.04)
+    assert change.brightness == pytest.approx(1, abs=0.005)
+    assert change.ambient == pytest.approx(0, abs=0.005)
