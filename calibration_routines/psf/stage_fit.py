@@ -47,8 +47,9 @@ MAX_BRIGHTNESS_DRIFT = 0.1
 _LEAST_VISITS = 3  # of a lamp that flickers: fewer do not tell a slope
 _SURE = 3.0  # standard deviations of a visit's brightness: what is less is not called a drift
 _CORRECTABLE = (0.2, 5.0)  # brightness over the first visit's: beyond, it is another light, not a drift
-MAX_GROWTH = 5e-4
-"""Change of the pattern's size between two visits that is called a motion along the axis."""
+MAX_GROWTH = 1.5e-4
+"""Change of the pattern's size between two visits that is called a motion along the axis: some five times
+what visits without one differ by, shaking and creeping ones included."""
 MAX_PLACE_DRIFT_PX = 0.5
 """Shift of the reference's pattern that is called a drift, pixels."""
 CREEP_PX = 0.2

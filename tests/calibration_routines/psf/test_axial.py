@@ -146,6 +146,17 @@ def test_without_retakes_the_slip_is_reported(bench: Bench, tmp_path: Path) -> N
     assert sweep_outcome(done).verdict[-1] == "Not to be relied on, hence kept as doubtful_calibration."
 
 
+def test_a_third_of_a_millimetre_lost_along_the_axis_is_told_by_two_visits(
+    tmp_path: Path,
+) -> None:
+    slips = TINY.replace("[stage]", "[stage]\naxes.z_um.slip = 300\naxes.z_um.slip_at_move = 6")
+    with open_bench(parse_config(slips, None)) as bench:
+        assert bench.stage is not None
+        bench.stage.home()
+        (said,) = calibrate_sweep(bench, SWEEP, tmp_path).findings
+    assert "smaller: the source came farther. z lost steps" in said
+
+
 def test_a_plane_that_saturates_is_taken_again_with_a_shorter_exposure(bench: Bench, tmp_path: Path) -> None:
     found = expose_sweep(bench, SWEEP)
     too_long = [1.3 * e if i == 1 else e for i, e in enumerate(found.exposures_ms)]
