@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
+from copy import copy
 from dataclasses import dataclass, replace
 
 import cv2
@@ -34,6 +35,8 @@ Counts = npt.NDArray[np.uint8] | npt.NDArray[np.uint16]
 Float = npt.NDArray[np.float32]
 
 _NOISE_PX = 250_000
+_LONE = 6.0  # times the median around it: a Gaussian spot of 1.1 pixels in the middle of one is six times
+_FAR = 10.0  # deviations of the noise
 
 
 @dataclass(frozen=True, slots=True)
@@ -103,6 +106,23 @@ class DarkModel:
             self.late_hot, self.hot = int(np.count_nonzero(late)), self.hot | late
             more = float(np.median(_mean(stack[first:]) - _mean(stack[:first])))
             self.brightening_per_ms = more / self._exposures_ms[longest]
+
+    def with_lone(self, image: Float) -> DarkModel:
+        """Return it with the pixels of an image, (height, width) or (height, width, 3), that no light lit.
+
+        A pixel that turns hot after the dark frames stands alone, however sharp the light is: brighter by
+        far than noise, and :data:`_LONE` times as bright as the median of the 3 x 3 pixels around it. A spot
+        as narrow as a pixel and a tenth is not.
+        """
+        median = cv2.medianBlur(np.ascontiguousarray(image), 3)
+        beyond = image - median
+        noise = 1.4826 * float(np.median(np.abs(beyond - np.median(beyond))))
+        lone = (beyond > _FAR * noise) & (image > _LONE * np.maximum(median, 0.0)) & (beyond > 0)
+        if not lone.any():
+            return self
+        other = copy(self)
+        other.hot = self.hot | lone
+        return other
 
     def at(self, exposure_ms: float) -> Float:
         """Return the expected dark frame, float32 counts."""

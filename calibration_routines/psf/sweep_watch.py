@@ -144,9 +144,9 @@ class SweepWatch:
         take = 1
         while True:
             plane = self._plane(point, taken)
-            steady = plane_light(plane, self._dark_model(plane.full_scale))
+            steady, dark = self._light(plane)
             image = _reduced(steady)
-            quality = self._judged(plane, steady, image)
+            quality = self._judged(plane, steady, image, dark)
             again = quality.retake and self.take_again is not None and take <= self._sweep.retakes
             number, total = self._numbers[point], len(self._numbers)
             self._report(PointTaken(number, total, take, quality, plane.exposure_ms, again, image))
@@ -169,11 +169,21 @@ class SweepWatch:
             off_axis=point not in self._central,
         )
 
-    def _judged(self, plane: PlaneFrames, steady: Steadied, image: Float) -> PsfQuality:
+    def _light(self, plane: PlaneFrames) -> tuple[Steadied, DarkModel]:
+        """Return a point's light without pixels that turned hot, of which later dark frames tell, and those.
+
+        They stay where they are and would be taken for other light and for a pattern that is cut.
+        """
+        dark = self._dark_model(plane.full_scale)
+        steady = plane_light(plane, dark)
+        now = dark.with_lone(steady.mean)
+        return (steady, dark) if now is dark else (plane_light(plane, now), now)
+
+    def _judged(self, plane: PlaneFrames, steady: Steadied, image: Float, dark: DarkModel) -> PsfQuality:
         frame_shape = plane.frames.shape[1:3]
         factor = max(1, frame_shape[0] // image.shape[0])
         binning = max(1, self._sweep.binning)
-        found = measure_point(plane, image[np.newaxis], steady, self._dark_model(plane.full_scale), binning)
+        found = measure_point(plane, image[np.newaxis], steady, dark, binning)
         found = replace(
             found,
             centroid_px=(found.centroid_px[0] * factor / binning, found.centroid_px[1] * factor / binning),
@@ -214,10 +224,10 @@ class SweepWatch:
     def _visit(self, taken: list[Snapshot]) -> None:
         assert self._reference is not None
         plane = self._plane(self._reference, taken)
-        steady = plane_light(plane, self._dark_model(plane.full_scale))
+        steady, dark = self._light(plane)
         image = _reduced(steady)
         if self._first_visit is None:
-            seen = self._judged(plane, steady, image)
+            seen = self._judged(plane, steady, image, dark)
             self._planes += [] if seen.retake else [seen]
             self._first_visit = self._reference, image
             self._change, visit = NO_CHANGE, SourceVisit(1, self._points_done, 1.0, 0.0, ())

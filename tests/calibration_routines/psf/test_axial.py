@@ -12,6 +12,7 @@ import pytest
 from calibration_routines import (
     AxialSweep,
     CalibrationError,
+    PointTaken,
     SweepEvent,
     axial_planes,
     calibrate_sweep,
@@ -155,6 +156,21 @@ def test_a_third_of_a_millimetre_lost_along_the_axis_is_told_by_two_visits(
         bench.stage.home()
         (said,) = calibrate_sweep(bench, SWEEP, tmp_path).findings
     assert "smaller: the source came farther. z lost steps" in said
+
+
+def test_pixels_that_turn_hot_meanwhile_are_not_taken_for_other_light_nor_for_a_cut_pattern(
+    tmp_path: Path,
+) -> None:
+    late = TINY + "late_hot_pixels = 300\nlate_hot_e_per_s = 1e6\nlate_hot_after_s = 8\n"
+    seen: list[SweepEvent] = []
+    with open_bench(parse_config(late, None)) as bench:
+        assert bench.stage is not None
+        bench.stage.home()
+        done = calibrate_sweep(bench, SWEEP, tmp_path, listener=Following(lambda _status: None, seen.append))
+    assert done.late_hot > 250
+    said = [event.quality.findings if isinstance(event, PointTaken) else event.findings for event in seen]
+    assert len(said) >= 7
+    assert not [words for each in said for words in each if "other light" in words or "edge" in words]
 
 
 def test_a_plane_that_saturates_is_taken_again_with_a_shorter_exposure(bench: Bench, tmp_path: Path) -> None:
