@@ -164,7 +164,9 @@ def settled(
             frames = f"{len(run.records)} frames of {command}"
             words = f"{frames}. To have them seen again, and what they lack taken: {going_on(run)}"
         elif done:
-            words = f"a recording, {run.condition}, with {len(run.records)} of {run.n_frames} frames."
+            there, bare = len(run.records) + len(run.unlisted), len(run.unlisted)
+            words = f"a recording, {run.condition}, with {there} of {run.n_frames} frames"
+            words += f", {bare} of them without metadata." if bare else "."
     else:
         words = f"complete already, {run.n_frames} frames read back, all as they were written."
         if result := result_of(path):

@@ -282,6 +282,8 @@ def read_lines(path: Path, *, unread: bool = False) -> tuple[list[dict[str, Any]
     require_plausible(path, require_file(path, error=RunError), stored_bytes(path), error=RunError)
     with path.open("rb") as file:
         for number, line in enumerate(iter(lambda: file.readline(_LONGEST_LINE), b""), start=1):
+            if line.endswith(b"\r\n"):  # a program that copied it as text: what it says is whole
+                line = line[:-2] + b"\n"
             if unread and (frame := _frame_line(line)) is not None:
                 records.append({"kind": "frame", UNREAD: frame})
                 continue

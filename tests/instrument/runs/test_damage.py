@@ -371,6 +371,40 @@ def test_what_verify_says_that_resume_does_is_what_it_does(runs: tuple[Path, Pat
     assert look(path).remedy().startswith("Put slm/no-image back from a backup")
 
 
+def test_a_log_that_was_copied_as_text_of_another_system_is_whole(tmp_path: Path) -> None:
+    with new_run(tmp_path) as writer:
+        writer.start(steps=5)
+        writer.write([frame(i) for i in range(3)])
+        path = writer.finish(FinishReason.ABORTED).path
+    log = path / "log.jsonl"
+    log.write_bytes(log.read_bytes().replace(b"\n", b"\r\n"))
+    run = Run.open(path)
+    assert not run.bad_lines
+    assert [run.metadata(i) for i in range(3)] == [frame(i).metadata for i in range(3)]
+    assert verify(run).is_sound, verify(run).lines()
+    again = AppendOnlyLog(log)
+    again.append([replace(run.records[2], index=3).to_json()])
+    again.close()
+    assert sorted(Run.open(path).records) == [0, 1, 2, 3]
+
+
+def test_images_without_a_line_are_counted_alike_by_resume_and_verify(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with new_run(tmp_path, plan=None) as writer:
+        writer.start()
+        writer.write([frame(i) for i in range(4)])
+        path = writer.finish(FinishReason.COMPLETED).path
+    log = path / "log.jsonl"
+    data = bytearray(log.read_bytes())
+    data[data.index(b'"frame", "index": 3') + 20] = 7
+    log.write_bytes(data)
+    assert main(["resume", str(path)]) == 0
+    assert "with 4 of 4 frames, 1 of them without metadata" in capsys.readouterr().out
+    assert main(["verify", str(path)]) == 0
+    assert "4 of 4 frames read back" in capsys.readouterr().out
+
+
 def test_a_recording_keeps_images_without_a_line_and_marks_the_rest_as_lost(tmp_path: Path) -> None:
     with new_run(tmp_path, plan=None) as writer:
         writer.start()
