@@ -31,6 +31,7 @@ from instrument.files.errors import in_words
 from tests.fuzz.readers import READERS, Reader
 
 CORPUS = Path(__file__).parent / "corpus"
+_OURS = tuple(f"{Path(__file__).parents[2] / room}/" for room in ("instrument", "recon", "drivers", "tests"))
 MOST_SECONDS = 2.0
 MOST_BYTES = 500 << 20
 TOKENS = (
@@ -124,8 +125,8 @@ def trouble(reader: Reader, path: Path) -> str:
     signal.setitimer(signal.ITIMER_PROF, MOST_SECONDS + 1, MOST_SECONDS + 1)  # again: a reader may begin anew
     try:
         reader.read(path)
-    except TooSlowError:
-        return "takes too long"
+    except TooSlowError as error:
+        return f"takes too long: {time.process_time() - began_s:.1f} s of the processor, at {error}"
     except RecursionError as error:
         return f"RecursionError: {error}"
     except Exception as error:  # noqa: BLE001 - that is what is looked for
@@ -176,8 +177,13 @@ def fuzz(name: str, *, seconds: float, runs: int, seed: int, keep: bool) -> tupl
     return count, found
 
 
-def _too_slow(_number: int, _frame: FrameType | None) -> None:
-    raise TooSlowError
+def _too_slow(_number: int, frame: FrameType | None) -> None:
+    """End a reader, and say where in this program it was."""
+    inside = frame
+    while inside is not None and not inside.f_code.co_filename.startswith(_OURS):
+        inside = inside.f_back
+    inside = inside or frame
+    raise TooSlowError("" if inside is None else f"{Path(inside.f_code.co_filename).name}:{inside.f_lineno}")
 
 
 def main() -> int:

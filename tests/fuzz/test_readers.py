@@ -6,6 +6,8 @@ import io
 import json
 import lzma
 import os
+import re
+import signal
 import struct
 import tracemalloc
 import zipfile
@@ -24,12 +26,14 @@ from instrument.files import pieces, reading
 from instrument.files.errors import BenchError
 from instrument.files.images import read_image, write_image
 from instrument.files.ome_zarr import ome_attributes
+from instrument.files.record import of_kind
 from instrument.plan.model import load_plan
 from instrument.reconstruction.film import Film
 from instrument.reconstruction.stored_result import open_result
 from instrument.volumes.opening import open_volume
+from tests.fuzz import __main__ as fuzzer
 from tests.fuzz.__main__ import CORPUS, fuzz
-from tests.fuzz.readers import READERS
+from tests.fuzz.readers import READERS, Reader
 
 
 @pytest.mark.parametrize("name", READERS)
@@ -38,6 +42,24 @@ def test_a_short_fuzz_and_all_that_broke_a_reader_before(name: str) -> None:
     count, found = fuzz(name, seconds=30, runs=kept + 12, seed=2, keep=False)
     assert count
     assert not found, found
+
+
+def test_a_reader_that_takes_too_long_is_told_with_the_place_and_the_time(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def slow(_path: Path) -> None:
+        while True:
+            of_kind({"a": [1, 2, 3]}, {"a": [int]})
+
+    monkeypatch.setattr(fuzzer, "MOST_SECONDS", -0.95)  # ended a second later: a twentieth
+    before = signal.signal(signal.SIGPROF, fuzzer._too_slow)
+    try:
+        words = fuzzer.trouble(Reader(lambda folder: folder, slow), tmp_path)
+    finally:
+        signal.signal(signal.SIGPROF, before)
+    assert re.fullmatch(
+        r"takes too long: [0-9.]+ s of the processor, at (record|test_readers).py:[0-9]+", words
+    )
 
 
 @pytest.mark.parametrize("read", [load_config, load_plan, read_image, open_volume, open_result])
