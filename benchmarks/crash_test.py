@@ -7,13 +7,13 @@
     python benchmarks/crash_test.py run record --clock       and the clock jumps by hours all the while
 
 Each trial carries out one command of the terminal on the simulated bench in a process of its own and kills
-it: runs, sweeps, recordings and the window once the run's folder is there (at any time, or just after one of
-the frames), finishing once the run's end is being written, files (reconstruct, video, hologram) at any time.
-It is gone on with as a user would, killed again with half the probability, until it ends. Every frame is
-unlike every other, and is told with its checksum when ``write`` has returned: it must be there, the same, in
-its own place, at every later look. No frame may be taken twice once its line is in the log; every run must
-open and verify; files must be those of an unharmed process; nothing else may lie about in the end. Exit
-status 1 when any of it fails.
+it: runs, sweeps, recordings and the window once the run's folder is there (at any time, or just after one
+of the frames), finishing once the run's end is being written, files (reconstruct, video, hologram, points)
+at any time. It is gone on with as a user would, killed again with half the probability, until it ends.
+Every frame is unlike every other, and is told with its checksum when ``write`` has returned: it must be
+there, the same, in its own place, at every later look. No frame may be taken twice once its line is in the
+log; every run must open and verify; files must be those of an unharmed process; nothing else may lie about
+in the end. Exit status 1 when any of it fails.
 
 ``kill -9`` ends the process, not the kernel: that everything is also synced in the right order, so that a
 power cut costs no more, is held by tests/instrument/runs/test_store_order.py, tests/kernel_vm/power_cut.py.
@@ -102,7 +102,7 @@ class Work:
         for name, image in (("psf", psf), ("scene", seen)):
             write_image(self.given / f"{name}.tif", (5e4 * image / image.max()).astype(np.uint16))
         for command in kind.given:
-            self.whole(self.given, command)
+            self.whole(self.given, in_folder(command, self.given))
         if kind.cut_after is not None:
             self.attempt(self.given, kind.first, (kind.cut_after, 0.0))
 
@@ -202,7 +202,11 @@ class Work:
         shutil.rmtree(folder)
 
     def _same(self, folder: Path, tally: Tally) -> None:
-        """Compare pixels with the unharmed process's."""
+        """Compare pixels and places with the unharmed process's."""
+        places = Path("points.csv")
+        if (self._parent / "whole" / places).is_file():
+            one, other = ((at / places).read_bytes() for at in (folder, self._parent / "whole"))
+            tally.found("different", int(one != other), folder / places)
         for name in ("picture.tif", "slm.png"):
             if (self._parent / "whole" / name).is_file():
                 one, other = (read_image(at / name).pixels for at in (folder, self._parent / "whole"))
@@ -273,8 +277,8 @@ def judge(runs: list[Path], promised: dict[int, int], kept: dict[int, bytes], ta
     tally.found("repeated", len(twice) + len(changed), f"{run.path}: twice {twice}, changed {changed}")
 
 
-def kill(name: str, kills: int, number: int, *, clock_jumps: bool) -> Tally:
-    """Kill one kind of work so often, and return what it came to."""
+def kill(name: str, kills: int, number: int, seconds: float, *, clock_jumps: bool) -> Tally:
+    """Kill one kind of work so often, or for so long, and return what it came to."""
     tally = Tally()
     with tempfile.TemporaryDirectory(prefix="crash-test-") as folder:
         parent = Path(folder)
@@ -298,8 +302,8 @@ def kill(name: str, kills: int, number: int, *, clock_jumps: bool) -> Tally:
                 return 0, random.uniform(0.0, 1.05 * done.lived_s)
             return random.randint(1, len(sums)), random.uniform(0.0, 0.03)
 
-        fruitless = 0
-        while tally.kills < kills and fruitless < 50:
+        fruitless, ends_s = 0, time.monotonic() + seconds
+        while tally.kills < kills and fruitless < 50 and time.monotonic() < ends_s:
             before = tally.kills
             job.trial(tally, unharmed, choose)
             fruitless = 0 if tally.kills > before else fruitless + 1
@@ -311,6 +315,7 @@ def command_line() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("kind", nargs="*", choices=[*KINDS, []], help="kinds of work [default: all]")
     parser.add_argument("--kills", type=int, default=50, help="of each kind")
+    parser.add_argument("--seconds", type=float, default=float("inf"), help="of each kind, at most")
     parser.add_argument("--seed", type=int, default=1)
     signals = {"kill": signal.SIGKILL, "term": signal.SIGTERM, "hup": signal.SIGHUP}
     signals |= {"int": signal.SIGINT, "stop": signal.SIGSTOP}
@@ -327,7 +332,7 @@ def command_line() -> int:
     wrong = 0
     for name in options.kind or KINDS:
         began_s = time.monotonic()
-        tally = kill(name, options.kills, signals[options.signal], clock_jumps=options.clock)
+        tally = kill(name, options.kills, signals[options.signal], options.seconds, clock_jumps=options.clock)
         stored = sorted(tally.stored_at_kill) or [0]
         print(
             f"{name}: {tally.kills} kills in {tally.trials} trials, {time.monotonic() - began_s:.0f} s; "

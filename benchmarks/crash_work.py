@@ -82,6 +82,24 @@ _VIDEO = ("reconstruct", RUN, "--video", *_SOLVED, "-n", "10", "--out", "film.om
 _HOLOGRAM = ("hologram", "scene.tif", "--expansion", "1", "--iterations", "15", "--out", "slm.png")
 _RECORD = ("record", "--source", "--frames", "40", "--exposure-ms", "2", "--out", "runs")
 _SWEEP = ("calibrate", "axial", "--z-min", "20", "--average", "1", "--dark-frames", "1", "--out", "runs")
+_ONE_PSF = ("--model", "convolution", "--bin", "1")
+_VOLUME = (
+    (*_SWEEP, "--z-max", "30", "--planes", "2"),
+    ("snap", "--source", "--exposure-ms", "2", "--out", "photo.tif"),
+    (
+        "reconstruct",
+        "--volume",
+        RUN,
+        "--image",
+        "photo.tif",
+        *_ONE_PSF,
+        "-n",
+        "20",
+        "--out",
+        "volume.ome.zarr",
+    ),
+)
+_POINTS = ("points", "volume.ome.zarr", "--fit", "--out", "points.csv", "--force")
 KINDS = {
     "run": Kind(_RUN),
     "sweep": Kind(_SWEEP),
@@ -93,6 +111,7 @@ KINDS = {
     ),
     "video": Kind(_VIDEO, _VIDEO, "start", given=(_RECORD,)),
     "hologram": Kind(_HOLOGRAM, (*_HOLOGRAM, "--force"), "start"),
+    "points": Kind(_POINTS, _POINTS, "start", given=_VOLUME),
     "window": Kind(("window",)),
 }
 
