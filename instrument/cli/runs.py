@@ -122,5 +122,7 @@ def resume(
     elif isinstance(outcome.result, Run):
         for words in outcome.verdict:
             typer.echo(f"{run}: {words}")
+        if not outcome.good:
+            raise typer.Exit(1)
     else:
         print_outcome(Console(), outcome)

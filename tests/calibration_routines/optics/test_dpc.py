@@ -85,6 +85,11 @@ def test_a_run_that_was_cut_off_is_resumed_to_its_surface(
     assert "Height" not in said
     assert f"To have them analysed again, move {run / 'dpc.json'} away first." in said
     (run / "dpc.json").rename(tmp_path / "before.json")
+    (run / "dpc.json").write_bytes((tmp_path / "before.json").read_bytes()[:99])
+    assert main(["resume", str(run)]) == 1
+    said = " ".join(capsys.readouterr().out.split())
+    assert f"But what was made of them is damaged: {run / 'dpc.json'}: " in said
+    (run / "dpc.json").unlink()
     assert main(["resume", str(run)]) == 0
     assert "Height" in capsys.readouterr().out
 
