@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import io
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -11,9 +12,11 @@ from typing import Any
 import numpy as np
 
 from instrument.display.hologram_files import HologramFiles
+from instrument.files.atomic import protect
 from instrument.files.errors import FileError
 from instrument.files.figures import Convergence, Panel, Summary, save_figure, summary_figure
 from instrument.files.images import side_car
+from instrument.files.reading import read_bytes
 from instrument.files.record import plain, value_of
 from instrument.files.slm_image import phase_levels, write_slm_image
 from recon.base.declare import record
@@ -49,11 +52,11 @@ def read_spots(path: Path) -> SpotList:
     CSV with a line of names: ``y`` and ``x`` in fractions of the field from its top left corner, and where
     wanted ``intensity`` and ``z_mm``.
     """
-    if not path.is_file():
+    if not path.exists():
         raise FileError(path, "there is no such file; spots are ROWSxCOLUMNS or a CSV file.")
     try:
-        with path.open(newline="", encoding="utf-8-sig") as file:
-            lines = list(csv.DictReader(file))
+        protect(path)
+        lines = list(csv.DictReader(io.StringIO(read_bytes(path).decode("utf-8-sig"), newline="")))
     except (csv.Error, UnicodeDecodeError) as error:
         raise FileError(path, f"is no CSV file: {error}.") from error
     if not lines or not {"y", "x"} <= set(lines[0]):

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import io
 import threading
 import time
-import zipfile
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -15,6 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from instrument.files.calibration_file import find_calibration, load_calibration
+from instrument.files.decoding import require_npy
 from instrument.files.errors import BenchError, FileError, count
 from instrument.files.images import ImageFile
 from instrument.plan.illumination import DARK, PATTERN
@@ -253,11 +252,10 @@ def _require_same_plan(run: Run, sheet: Run) -> None:
 
 def _patterns_from_file(path: Path, shape: tuple[int, ...]) -> Floats:
     try:
-        patterns = np.load(io.BytesIO(path.read_bytes()), allow_pickle=False)
-    except (OSError, ValueError, EOFError, zipfile.BadZipFile) as error:
+        require_npy(path)
+        patterns = np.load(path, allow_pickle=False)
+    except (OSError, ValueError, EOFError) as error:
         raise FileError(path, f"cannot be read: {error}.") from None
-    if not isinstance(patterns, np.ndarray):
-        raise FileError(path, "is an .npz archive by another name; one plain .npy array is expected.")
     if patterns.shape != shape or patterns.dtype.kind not in "fiu":
         raise FileError(
             path,

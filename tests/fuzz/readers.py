@@ -15,6 +15,7 @@ import tifffile
 
 from instrument.bench.config_file import load_config, template
 from instrument.display.alignment import load_alignment
+from instrument.display.spots import read_spots
 from instrument.files.calibration_file import calibrated_depths_um, load_calibration, save_calibration
 from instrument.files.images import read_image, read_stack
 from instrument.files.record import plain
@@ -24,6 +25,7 @@ from instrument.plan.model import load_plan
 from instrument.reconstruction.again import can_be_fitted, made_of
 from instrument.reconstruction.film import Film
 from instrument.reconstruction.options import InputOptions
+from instrument.reconstruction.patterned import _patterns_from_file
 from instrument.reconstruction.request import VolumeRequest
 from instrument.reconstruction.stored_result import StoredResult, open_result
 from instrument.reconstruction.video_files import VideoPictures, create_output
@@ -69,6 +71,11 @@ def _png(folder: Path) -> Path:
 def _npy(folder: Path) -> Path:
     np.save(folder / "a.npy", _pixels())
     return folder / "a.npy"
+
+
+def _patterns(folder: Path) -> Path:
+    np.save(folder / "patterns.npy", np.ones((3, 12, 16), np.float32))
+    return folder / "patterns.npy"
 
 
 def _npz(folder: Path) -> Path:
@@ -235,6 +242,8 @@ READERS: dict[str, Reader] = {
         lambda folder: _calibration(folder) / "psfs.ome.zarr", _volume, ("zarr.json", "0/zarr.json")
     ),
     "video": Reader(_video, _film, ("zarr.json", "0/zarr.json", "0/c/0/0/0")),
+    "spots": Reader(_written("spots.csv", "y,x,intensity,z_mm\n0.2,0.3,1,0\n0.7,0.6,0.5,2\n"), read_spots),
+    "patterns": Reader(_patterns, lambda path: _patterns_from_file(path, (3, 12, 16))),
     "alignment": Reader(_copied("alignment.json"), load_alignment),
     "slm-calibration": Reader(_copied("slm-calibration.json"), load_slm_correction),
     "stability": Reader(_copied("stability/stability.json"), read_stability),

@@ -22,14 +22,18 @@ import pytest
 import zarr
 
 from instrument.bench.config_file import load_config
+from instrument.display.spots import read_spots
 from instrument.files import pieces, reading
-from instrument.files.errors import BenchError
+from instrument.files.atomic import write_bytes
+from instrument.files.errors import BenchError, FileError
 from instrument.files.images import read_image, write_image
 from instrument.files.ome_zarr import ome_attributes
 from instrument.files.record import of_kind
 from instrument.plan.model import load_plan
 from instrument.reconstruction.film import Film
+from instrument.reconstruction.patterned import _patterns_from_file
 from instrument.reconstruction.stored_result import open_result
+from instrument.tasks.task import guarded
 from instrument.volumes.opening import open_volume
 from tests.fuzz import __main__ as fuzzer
 from tests.fuzz.__main__ import CORPUS, fuzz
@@ -74,6 +78,27 @@ def test_a_pipe_and_an_endless_device_are_refused_at_once(tmp_path: Path, read: 
         assert (
             read is not load_plan or suffix not in (".toml", ".json") or "pipe or device" in str(caught.value)
         )
+
+
+def test_a_list_of_spots_and_patterns_are_read_like_other_files(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "pipe")
+    (tmp_path / "zero").symlink_to("/dev/zero")
+    with (tmp_path / "nothing").open("wb") as file:
+        file.truncate(20 << 30)
+    with (tmp_path / "claims").open("wb") as file:
+        huge = {"descr": "<f8", "fortran_order": False, "shape": (10**6, 10**6)}
+        np.lib.format.write_array_header_1_0(file, huge)
+    for name in ("pipe", "zero", "nothing", "claims"):
+        with pytest.raises(FileError):
+            _patterns_from_file(tmp_path / name, (3, 12, 16))
+        with pytest.raises(FileError):
+            read_spots(tmp_path / name)
+    spots = tmp_path / "spots.csv"
+    spots.write_text("y,x\n0.2,0.3\n")
+    with guarded({}):
+        read_spots(spots)
+        with pytest.raises(FileError, match="no output replaces an input"):
+            write_bytes(spots, b"a preview")
 
 
 def test_what_is_not_there_yet_is_not_waited_for(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
