@@ -90,6 +90,7 @@ class Geometry:
     aperture_mm: tuple[float, float] | None = None
     """``(height, width)`` of the aperture on the diffuser."""
     wavelength_nm: float | None = None
+    """Of the light that the PSFs were taken in."""
 
     def __post_init__(self) -> None:
         for name in ("pixel_pitch_um", "diffuser_distance_mm", "wavelength_nm"):

@@ -102,6 +102,8 @@ def photograph(
 
     Parameters
     ----------
+    bench : Bench
+        Open.
     exposure_ms : float, optional
         By default what :func:`~calibration_routines.expose_scene` finds.
     folder : path, optional
@@ -112,6 +114,13 @@ def photograph(
         Software binning, on top of the camera's; the same as the calibration's.
     control : RunControl, optional
         To pause, abort or stop the run from another thread.
+    listener : Listener, optional
+        Told of each step and frame.
+
+    Returns
+    -------
+    Photograph
+        ``measurement`` float32, (height, width[, 3]), counts less the dark frames'; its run and exposure.
 
     Raises
     ------

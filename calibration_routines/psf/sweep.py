@@ -128,6 +128,7 @@ def calibrate_sweep(
     ----------
     bench : Bench
         Open, its stage homed.
+    sweep : AxialSweep, LateralSweep, VolumeSweep or PointSweep
     folder : path, optional
         Where the run's folder is made; the bench's data folder by default.
     exposures : SweepExposures, optional
@@ -138,6 +139,11 @@ def calibrate_sweep(
         Its ``event`` is called with a :class:`~calibration_routines.PointTaken` as soon as a PSF has been
         taken and judged, and with a :class:`~calibration_routines.SourceVisit` after each visit to the
         reference point, in the thread that sweeps.
+
+    Returns
+    -------
+    SweepCalibration
+        The calibration, its folder (``path``), and how good each PSF is.
 
     Raises PlanError, SettingsError when the sweep leaves the limits of the bench or the disk (nothing moved);
     CalibrationError when no exposure is usable, or the run was ended before its last frame.

@@ -112,11 +112,14 @@ def _is_position(point: object) -> bool:
 
 @dataclass(frozen=True, kw_only=True)
 class PointSweep(Taking):
-    """PSFs at listed places, ``(x, y, z)`` from the diffuser's centre."""
+    """PSFs at listed places."""
 
     points_um: tuple[Position, ...]
+    """``(x, y, z)`` from the diffuser's centre, micrometres."""
     kind: str = "volume"
+    """What its run is called, and its record."""
     by_hand: bool = False
+    """Somebody moves the source, without a stage."""
 
     def __post_init__(self) -> None:
         if is_several(self.points_um) and all(map(is_several, self.points_um)):

@@ -60,8 +60,13 @@ CALIBRATION = RecordFormat(
 def save_calibration(calibration: Calibration, folder: Path | str, *, overwrite: bool = False) -> Path:
     """Write ``calibration`` as a folder, whole or not at all.
 
-    The folder, and its parent where missing, is made by this call, and returned. ``overwrite`` replaces a
-    calibration already there, never anything else.
+    The ``folder``, and its parent where missing, is made by this call. ``overwrite`` replaces a calibration
+    already there, never anything else.
+
+    Returns
+    -------
+    Path
+        The folder.
 
     Raises CalibrationFileError when something is there already, the place cannot be written, or the disk is
     full. What was there before is still there then.

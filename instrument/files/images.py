@@ -145,9 +145,15 @@ def read_stack(path: Path | str, *, leave_out: Path | None = None) -> ImageFile:
 
 
 def read(path: Path | str) -> ImageFile:
-    """Read what a file holds, or a folder: one image, or a stack. Errors as :func:`read_image`.
+    """Read what a file holds, or a folder, ``path``: one image, or a stack. Errors as :func:`read_image`.
 
     Three planes of NumPy's are a picture in colour, or a stack where an array beside them tells depths.
+
+    Returns
+    -------
+    ImageFile
+        ``pixels`` uint8, uint16 or float32 in the file's own units, never rescaled: (height, width[, 3]), or
+        a stack with one more axis in front; ``metadata`` that were kept with them.
     """
     if not isinstance(path, str | PathLike):
         raise BenchError(
@@ -172,9 +178,10 @@ def read(path: Path | str) -> ImageFile:
 
 
 def write_image(path: Path | str, image: npt.NDArray[Any], metadata: Mapping[str, Any] | None = None) -> None:
-    """Write one image (or, as TIFF or .npy, a stack), whole or not at all.
+    """Write one ``image`` (or, as TIFF or .npy, a stack), whole or not at all.
 
-    The suffix chooses the format: ``.tif`` and ``.npy`` keep any dtype, ``.png`` takes uint8 and uint16.
+    The suffix of ``path`` chooses the format: ``.tif`` and ``.npy`` keep any dtype, ``.png`` takes uint8 and
+    uint16.
     Colour of float32 is stored channel by channel, as ImageJ has it, with the levels that it is shown with.
     ``.ome.tif`` is an OME-TIFF, where ``metadata`` stand in OME's fields and a map annotation. They go into
     another TIFF's description (ImageJ's info of such colour), otherwise into a JSON file beside the image.

@@ -73,13 +73,20 @@ def chart(
     ----------
     subject : Result or str
         A result: its photograph, scored by pixels that are held out. Or the name of a simulated scene with
-        ground truth (``"sparse-picture"``, ``"beads"`` ...), of ``size`` pixels and ``seed``.
+        ground truth (``"sparse-picture"``, ``"beads"`` ...).
+    size, seed : int
+        Of a simulated scene: pixels along a side, and which draw.
     budget_s : float
         Seconds for all settings together.
     folder : path, optional
         Where the chart is kept while it is made: the same call goes on where it stopped.
     on_progress : callable, optional
         ``on_progress(setting, seconds_left)`` before each.
+
+    Returns
+    -------
+    Chart
+        Each setting's time, memory and error as it iterates; ``front()``, ``show()``, ``save(folder)``.
 
     Raises BenchError when there was no time for any setting; InputError when the subject cannot be charted.
     """

@@ -124,6 +124,12 @@ def hologram(
     **overrides
         Single options by name; ``alignment``: a file of ``align mask``.
 
+    Returns
+    -------
+    HologramShown
+        ``phase_rad``, (n_frames, height, width), radians; ``seen``, an image a plane in units of the target's
+        white, and how good they are. It shows and saves itself.
+
     Raises InputError, BenchError or FileError: what was found, what was expected, what to do.
     """
     require_hooks(on_progress, cancel)
@@ -150,7 +156,17 @@ def forecast_hologram(
     """Say what time and memory a hologram will take here, as busy as this machine is now.
 
     Its first iterations are carried out, all of it where that takes a few seconds: the same that
-    ``diffuserbench hologram --explain`` tells. Parameters and errors as of :func:`hologram`.
+    ``diffuserbench hologram --explain`` tells.
+
+    Parameters
+    ----------
+    picture, bench, options, slm, z_mm, **overrides
+        As of :func:`hologram`, whose errors it raises.
+
+    Returns
+    -------
+    Forecast
+        Seconds, and bytes at the peak beyond what the program takes.
     """
     asked = _Asked.of(picture, bench, options, slm, z_mm, overrides)
     return by_its_beginning(asked.display, asked.targets, asked.options)

@@ -38,7 +38,12 @@ from recon.types import Calibration
 
 @speaking
 def calibration(folder: Path | str) -> Calibration:
-    """Read a calibration: its folder, or the run that it was made in.
+    """Read a calibration: its ``folder``, or the run that it was made in.
+
+    Returns
+    -------
+    Calibration
+        PSFs float32, (n_places, n_channels, height, width), and where they were taken, micrometres.
 
     Raises FileError when there is none, more than one, or it is damaged.
     """
@@ -52,7 +57,12 @@ def calibration(folder: Path | str) -> Calibration:
 
 @speaking
 def run(folder: Path | str) -> Run:
-    """Open a run for reading, by its folder or that of the calibration in it.
+    """Open a run for reading, by its ``folder`` or that of the calibration in it.
+
+    Returns
+    -------
+    Run
+        Frames and what is known of each are read as they are asked for: ``images(label)``, ``metadata(n)``.
 
     Raises RunError where there is none.
     """
@@ -72,6 +82,11 @@ def bench(config: BenchConfig | Path | str | None = None, *, ask: Ask | None = N
         simulated benches. None: ``bench.toml`` in the working folder, else the simulated bench.
     ask : callable, optional
         Asks whoever stands at the bench to do something by hand.
+
+    Returns
+    -------
+    Bench
+        Its devices open; they are closed, light off and motion stopped, at the end of ``with``.
 
     Raises
     ------
@@ -128,6 +143,12 @@ def reconstruct(
         photograph's own pixels (a file, image or array) that it is divided by; of arrays also ``background``,
         ``patterns`` and ``lines``, as :class:`~recon.reconstruction.measurement.Measurement` has them.
 
+    Returns
+    -------
+    Result
+        ``volume`` float32, (n_z, height, width[, n_channels]), and of a picture ``image``, its one plane; in
+        the units in which PSFs and volume make the measurement. It shows and saves itself.
+
     Raises InputError, BenchError or FileError: what was found, what was expected, what to do.
     """
     if not isinstance(warm, Reconstruction | None):
@@ -168,6 +189,11 @@ def forecast(
         file or a calibration's folder stands for its film, with the film's options by name (``block``,
         ``workers`` ...); with ``patterned``, a sheet's run or its patterns as ``.npy``, for the picture of a
         run in patterned light. Of both all that ``diffuserbench reconstruct RUN`` would do is told.
+
+    Returns
+    -------
+    Forecast
+        Seconds, and bytes at the peak beyond what the program takes.
     """
     with _telling(on_stage) as told:
         if (run_of_frames := recording_of(image)) is not None:

@@ -201,9 +201,13 @@ def _title(shown: object) -> str:
 
 
 def show(*pictures: Any, **titled: Any) -> None:
-    """Show pictures beside one another: results, files, arrays, calibrations (the PSF nearest to the axis).
+    """Show pictures beside one another, below the cell of a notebook, else in a window.
 
-    Below the cell of a notebook, else in a window: ``db.show(photo, tv=first, l1=second)``.
+    Parameters
+    ----------
+    *pictures, **titled
+        Results, files, arrays (height, width[, 3]), calibrations (the PSF nearest to the axis); with a title
+        where given by name: ``db.show(photo, tv=first, l1=second)``.
 
     Raises BenchError when one of them is no picture, FileError when one cannot be read.
     """
@@ -252,7 +256,10 @@ def figure_png(figure: Figure) -> bytes:
 
 
 def show_figure(figure: Figure) -> None:
-    """Show a figure where there is a place for it; say where there is none."""
+    """Show a Matplotlib ``figure`` where there is a place for it; say where there is none.
+
+    Raises BenchError for what is no figure.
+    """
     if not hasattr(figure, "savefig"):
         raise BenchError(
             f"A figure of Matplotlib is shown, as result.figure() gives it, not {type(figure).__name__}: "

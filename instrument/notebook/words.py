@@ -116,10 +116,14 @@ def job_in_python(job: Job) -> Job:
 
 @speaking
 def open_result(path: Path | str) -> StoredResult:
-    """Open a picture or volume, by its own file or by the JSON record or preview beside it.
+    """Open a picture or volume, by its own file or by the JSON record or preview beside it: ``path``.
 
-    A volume's voxels are read when they are looked at. An image or volume from elsewhere opens too; nothing
-    is known of it then.
+    An image or volume from elsewhere opens too; nothing is known of it then.
+
+    Returns
+    -------
+    StoredResult
+        ``image`` float32, (height, width[, 3]); or ``volume``, whose voxels are read when they are looked at.
 
     Raises FileError when it is none, or its record is damaged.
     """

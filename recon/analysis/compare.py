@@ -109,11 +109,18 @@ def _of_binned(changes: list[Change], ratio: float) -> tuple[list[Change], tuple
 def compare(
     old: Calibration, new: Calibration, on_progress: Callable[[float], object] | None = None
 ) -> Comparison:
-    """Compare a calibration with an older one of the same camera; ``on_progress`` gets the share done.
+    """Compare a ``new`` calibration with an ``old`` one of the same camera.
+
+    ``on_progress`` gets the share done.
 
     Depths that the old one does not have are refocused. Shift alone moves pictures without blurring them; it
     counts when it differs between depths, or for the position in space. Of another binning the finer one is
     binned, and that is said.
+
+    Returns
+    -------
+    Comparison
+        What changed at up to three depths, whether to calibrate again, and why.
 
     Raises InputError when the PSFs are of other regions or cameras, or depths are not known.
     """

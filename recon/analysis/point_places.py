@@ -117,6 +117,11 @@ def point_places(
     on_progress : callable, optional
         Called with the share done.
 
+    Returns
+    -------
+    PointPlaces
+        Places, micrometres, and light, the brightest first, each with its deviation.
+
     Raises InputError when there is one plane, one is not in front of the diffuser, or there are more points
     than are told apart.
     """

@@ -151,6 +151,11 @@ def analyse(
         :func:`recon.evaluation.points_in_volumes.in_volumes`, for ``settings.volumes``.
     on_progress : callable, optional
         Called with what is being done and the share done.
+
+    Returns
+    -------
+    Analysis
+        Lengths in micrometres, angles in degrees; None where the calibration cannot tell.
     """
     require_calibration(calibration)
     require_argument("settings", settings, AnalysisSettings | None)

@@ -43,7 +43,7 @@ class AnalysisSettings:
     ``deflection_deg`` is the ``beta`` of Kuo 2020; ``cutoff_deg`` is along y and x. The lateral sampling
     follows from ``fall_off``, the sensor's response as a function of the tangents along y and x, else from
     a Gaussian of ``fall_off_deg``; the axial one (Eq. 5.10) from a microlens diffuser's ``lenslet_um`` and
-    the wavelength.
+    the wavelength. ``noise`` is the tests' images'.
     """
 
     z_um: float | None = option(
