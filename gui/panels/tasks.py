@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any, NamedTuple, get_args
 
 from PySide6.QtCore import Qt
-from PySide6.QtWidgets import QWidget
+from PySide6.QtWidgets import QLineEdit, QWidget
 
 from calibration_routines.psf.sweep_plan import SWEEP
 from gui.background import NewestOnly
@@ -45,6 +45,8 @@ _FOLDERS = ("FOLDER", "RUN", "CALIBRATION", "OLD", "NEW", "VIDEO|RUN", "RUN|RESU
 _FILMS = ("run", "video")
 """Options that name what a calibration is needed for."""
 _LEAST_FORM_PX = 300
+_BESIDE_PX = 8
+"""Of a field, on each side of its words."""
 _CALIBRATION = "calibration"
 
 
@@ -320,9 +322,20 @@ class TasksPanel(Panel):
     def _lend(self, lacking: int) -> None:
         """Give tables and pictures what they lack of the form's width, until something else is shown."""
         form, results = self._across.sizes()
-        if (more := min(lacking, form - _LEAST_FORM_PX)) > 0:
+        if (more := min(lacking, form - _LEAST_FORM_PX, self._spare_px())) > 0:
             self._lent_px += more
             self._across.setSizes([form - more, results + more])
+
+    def _spare_px(self) -> int:
+        """Return how much narrower the form may be before the words in its empty fields are cut off."""
+        lines = self._pages[self._running].form.findChildren(QLineEdit)
+        said = ((line, line.placeholderText()) for line in lines if line.isVisible() and not line.text())
+        spare = (
+            line.width() - line.fontMetrics().horizontalAdvance(words) - 2 * _BESIDE_PX
+            for line, words in said
+            if words
+        )
+        return min(spare, default=self.width())
 
     def _take_back(self) -> None:
         lent, self._lent_px = self._lent_px, 0

@@ -398,6 +398,12 @@ def test_a_picture_takes_of_the_forms_width_and_is_shown_larger(
     shown(qtbot, panel, "refocus")
     assert panel.stack.width() == form_px
     assert picture.show_larger() is None, "there is none"
+    shown(qtbot, panel, "analyze")
+    panel._succeeded(Done((chart,)))
+    qtbot.waitUntil(lambda: panel.found.results.currentWidget() is picture, timeout=WAIT_MS)
+    qtbot.wait(20)
+    assert not list(cut_off(panel._pages["analyze"].form)), "its words need the width"
+    panel.found.clear()
 
     picture.show_pixmap(QPixmap(1400, 1300))
     panel.found.results.setCurrentWidget(picture)
