@@ -6,7 +6,7 @@ from scipy.signal import convolve2d
 
 from recon.base import threads
 from recon.camera.base import estimate_norm
-from recon.camera.convolution import Convolution, field_of
+from recon.camera.convolution import GROUPS, Convolution, PlaneGroups, field_of
 from recon.errors import InputError
 
 
@@ -56,8 +56,9 @@ def test_one_depth_is_the_camera_of_one_depth():
     assert deep.norm_bound == pytest.approx(flat.norm_bound)
 
 
-def test_norm_bound_holds():
-    operator = Convolution(np.random.default_rng(4).random((4, 1, 8, 8)), (8, 8), dtype=np.float64)
+@pytest.mark.parametrize("n_z", [1, 2, 4])
+def test_norm_bound_holds(n_z):
+    operator = Convolution(np.random.default_rng(4).random((n_z, 1, 8, 8)), (8, 8), dtype=np.float64)
     assert 0.3 * operator.norm_bound < estimate_norm(operator) <= operator.norm_bound
 
 
@@ -76,6 +77,15 @@ def test_threads_do_not_change_a_bit():
     np.testing.assert_array_equal(*results)
 
 
+@pytest.mark.parametrize("n_planes", [0, 1, 5, GROUPS, 11])
+def test_each_plane_is_in_one_run_of_few(n_planes):
+    runs = {}
+    PlaneGroups(n_planes).run(lambda group, first, last: runs.update({group: range(first, last)}))
+    assert [z for group in sorted(runs) for z in runs[group]] == list(range(n_planes))
+    assert len(runs) == min(n_planes, GROUPS)
+    assert [group for group in sorted(runs) for _ in runs[group]] == list(PlaneGroups(n_planes).of_plane)
+
+
 def test_refuses_an_empty_depth_list():
     with pytest.raises(InputError, match="list of depths is empty"):
         Convolution(np.zeros((0, 1, 4, 4), np.float32), (4, 4))
@@ -91,3 +101,23 @@ def test_a_source_on_the_axis_casts_the_psfs_centre_on_the_sensors(sensor, psf_s
     scene[..., row, column] = 1.0  # an index: a whole number
     seen = camera.forward(scene)[0]
     assert seen[sensor[0] // 2, sensor[1] // 2] == pytest.approx(psf[psf_shape[0] // 2, psf_shape[1] // 2])
+
+
+def test_planes_of_an_adjoint_are_the_whole_ones():
+    rng = np.random.default_rng(6)
+    for channels in (1, 2):
+        operator = Convolution(rng.random((3, channels, 5, 6)), (7, 8), n_channels=2, dtype=np.float64)
+        y = rng.random(operator.range_shape)
+        whole = operator.adjoint(y)
+        for channel in (0, 1):
+            planes = np.stack(list(operator.adjoint_planes(y, channel)))
+            np.testing.assert_allclose(planes, whole[channel], atol=1e-12)
+
+
+def test_psfs_may_be_a_list_and_have_to_be_numbers():
+    listed = Convolution([[[1.0, 2.0], [3.0, 4.0]]], (4, 4))
+    assert listed.is_picture
+    assert listed.domain_shape[0] == 1
+    for nonsense in (np.full((1, 2, 2), "a"), np.full((1, 2, 2), 1j), None):
+        with pytest.raises(InputError, match="psfs must be an array"):
+            Convolution(nonsense, (4, 4))

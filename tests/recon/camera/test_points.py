@@ -162,9 +162,10 @@ def test_a_point_moves_half_a_pixel_at_once_at_most() -> None:
     assert place[0] == pytest.approx(0.5)
     assert abs(place[1]) < 0.01
     assert light > 0.85
-    left = seen.image(points((0.2, 0.0, 1.0))) - seen.image(points((0, 0, 1.0)))
-    near, _ = _refined(seen, left, np.zeros(2), 1.0)
-    assert near[0] == pytest.approx(0.2, abs=0.02)
+    for light in (1.0, 0.1, 20.0):
+        left = seen.image(points((0.2, 0.0, light))) - seen.image(points((0, 0, light)))
+        near, _ = _refined(seen, left, np.zeros(2), light)
+        assert near[0] == pytest.approx(0.2, abs=0.02)
 
 
 def test_a_move_that_gains_nothing_is_halved_twice_and_given_up() -> None:
