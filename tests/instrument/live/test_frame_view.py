@@ -52,6 +52,22 @@ def test_what_numpy_shows_until_then_is_what_is_shown_later(
         assert (later == SATURATED).any()
 
 
+def test_once_every_kind_of_frame_is_compiled_for_nothing_is_shown_by_numpy(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    kinds = set()
+
+    def filled(image: Any, *_: Any) -> None:
+        kinds.add((image.dtype.name, image.flags.c_contiguous, image.strides[0] < 0, image.flags.writeable))
+
+    monkeypatch.setattr(frame_view, "_compiled", threading.Event())
+    monkeypatch.setattr(frame_view, "fill_indices", filled)
+    frame_view.compile_for_frames()
+    whole, turned, mirrored = (True, False, False), (False, False, False), (False, True, False)
+    assert kinds == {(name, *kind) for name in ("uint8", "uint16") for kind in (whole, turned, mirrored)}
+    assert frame_view._compiled.is_set()
+
+
 def test_counts_are_shown_from_low_to_high_and_saturated_ones_apart() -> None:
     table = index_table(np.uint8, 10, 137, full_scale=200)
     assert [int(table[count]) for count in (0, 10, 11, 74, 137, 199, 200, 255)] == [
@@ -123,6 +139,8 @@ def test_a_line_is_sampled_once_a_pixel_between_the_pixels_and_within_the_frame(
     np.testing.assert_allclose(down[0], [3, 4, 5])
     np.testing.assert_allclose(down[1], [6, 16, 26])
     assert [len(of) for of in line_profile(ramp, (1.2, 1.2), (1.2, 1.2))] == [2, 2]
+    corner = line_profile(ramp, (5.9, 3.9), (5.6, 3.6))  # within the last pixel
+    np.testing.assert_allclose(corner[1], [35, 35])
     colour = np.stack([ramp, ramp + 3, ramp + 6], axis=2)
     np.testing.assert_allclose(line_profile(colour, (0.5, 1.5), (4.5, 1.5))[1], 13 + np.arange(5.0))
 

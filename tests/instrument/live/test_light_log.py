@@ -40,6 +40,8 @@ def test_a_frame_has_the_light_of_its_exposure_not_that_of_now(monkeypatch: pyte
     assert log.during(replace(frame, host_time_ns=1130 * MS)) == "scene"
     assert log.during(replace(frame, host_time_ns=3000 * MS)) == "scene, then point source"
     assert log.during(replace(frame, host_time_ns=50 * MS)) == "nothing lit"
+    since_before = replace(frame, host_time_ns=1050 * MS, exposure_ms=2000.0)
+    assert log.during(since_before) == "nothing lit, then scene"
 
 
 def test_what_the_operator_lights_is_not_known_before_he_was_asked() -> None:

@@ -141,3 +141,15 @@ def test_a_simulated_camera_is_asked_for_coarse_light_while_somebody_looks_only(
         live.stop()
         assert not camera.coarse_first
         assert live.coarse() is None
+
+
+def test_a_stream_that_ended_by_itself_is_closed_and_counted_before_the_next() -> None:
+    with open_bench(parse_config(BENCH, None)) as bench:
+        live, closed = LiveCamera(bench.camera), threading.Event()
+        ended = SimpleNamespace(is_running=False, acquired=1000, dropped=3, close=closed.set)
+        live._stream = cast(FrameStream, ended)
+        live.start()
+        assert closed.is_set()
+        assert live.status().acquired >= 1000
+        assert live.status().dropped == 3
+        live.stop()
