@@ -313,6 +313,19 @@ def test_which_solver_a_volumes_prior_gets(
     assert volume_solver(CAMERA, DATA, prior, room=Room(xp=object())) == elsewhere.__name__  # type: ignore[arg-type]
 
 
+def test_a_solvers_state_lives_in_its_room() -> None:
+    class Elsewhere:
+        """A scratch folder, or a device."""
+
+        def zeros(self, shape: tuple[int, ...], dtype: Any) -> tuple[Any, ...]:
+            return self, shape, np.dtype(dtype)
+
+    disk: Any = Elsewhere()
+    device: Any = Elsewhere()
+    assert Room(storage=disk).zeros((2, 3), np.float32) == (disk, (2, 3), np.dtype(np.float32))
+    assert Room(xp=device, storage=disk).zeros((2, 3), np.float32) == (device, (2, 3), np.dtype(np.float32))
+
+
 def test_a_volumes_solver_takes_one_channel() -> None:
     colours = Convolution(np.repeat(CAMERA_PSFS, 3, axis=1), SENSOR, dtype=np.float64)
     with pytest.raises(ValueError, match="One channel at a time, not 3"):

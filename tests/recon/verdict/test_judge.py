@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 import pytest
@@ -40,13 +41,14 @@ def learned(cases: list[Evidence], failed: list[bool]) -> Chances:
     return fitted(features, places, np.where(failed, 2.0, 0.5), range(len(cases)))
 
 
-@pytest.fixture(autouse=True)
-def planted(monkeypatch: pytest.MonkeyPatch) -> None:
+@cache
+def planted_chances() -> Chances:
     """Pictures that fail below a detail of 5, above 20 % unexplained, and by a PSF that repeats itself."""
+    rng = np.random.default_rng(3)
     cases, failed = [], []
     for detail in np.geomspace(0.5, 50, 15):
         for unexplained in np.geomspace(0.01, 1, 15):
-            ambiguity, load, shown = RNG.uniform(0.1, 0.9), RNG.uniform(0.03, 0.08), RNG.uniform(0.8, 1.25)
+            ambiguity, load, shown = rng.uniform(0.1, 0.9), rng.uniform(0.03, 0.08), rng.uniform(0.8, 1.25)
             cases.append(
                 evidence(
                     float(detail),
@@ -54,12 +56,16 @@ def planted(monkeypatch: pytest.MonkeyPatch) -> None:
                     signal=float(detail * shown),
                     ambiguity=ambiguity,
                     load=load,
-                    saturated=float(RNG.choice([0, 0.1])),
+                    saturated=float(rng.choice([0, 0.1])),
                 )
             )
             failed.append(bool(detail < 5 or unexplained > 0.2 or ambiguity > 0.6))
-    chances = learned(cases, failed)
-    monkeypatch.setattr(judge, "shipped_chances", lambda: {"picture tv": chances})
+    return learned(cases, failed)
+
+
+@pytest.fixture(autouse=True)
+def planted(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(judge, "shipped_chances", lambda: {"picture tv": planted_chances()})
 
 
 def test_regions_are_where_they_were_planted() -> None:
@@ -92,19 +98,21 @@ def test_who_overexposed_is_not_told_to_give_more_light() -> None:
     assert "More light" in " ".join(judge.verdict_on(evidence(1, 0.03, saturated=1e-3), "admm tv").sentences)
 
 
-def of_volumes(*, bad: bool, spread: float = 0) -> Evidence:
+def of_volumes(*, bad: bool, spread: float = 0, rng: np.random.Generator = RNG) -> Evidence:
     """Grainy and hazy where bad, and alike in all else; with no spread, the typical one of its kind."""
-    grain = 1 + spread * RNG.uniform(-0.1, 0.1, 3)
+    grain = 1 + spread * rng.uniform(-0.1, 0.1, 3)
     points = (2.0, 40.0, 1.6) if bad else (20.0, 3.0, 0.4)
     height, peaks, ends = (float(g * p) for g, p in zip(grain, points, strict=True))
     numbers = {"height": height, "peaks": peaks, "ends": ends, "planes": 4, "similarity": 0.7}
-    detail, saturated = 22 + spread * RNG.uniform(-4, 4), spread * float(RNG.choice([0, 0.1]))
+    detail, saturated = 22 + spread * rng.uniform(-4, 4), spread * float(rng.choice([0, 0.1]))
     return evidence(float(detail), 0.03, saturated=saturated, **numbers)
 
 
+@cache
 def volumes() -> Chances:
+    rng = np.random.default_rng(3)
     bad = [bool(k % 2) for k in range(60)]
-    return learned([of_volumes(bad=b, spread=1) for b in bad], bad)
+    return learned([of_volumes(bad=b, spread=1, rng=rng) for b in bad], bad)
 
 
 def test_who_overexposed_a_volume_is_not_told_to_give_more_light() -> None:

@@ -252,7 +252,7 @@ def shade_found(
         share = np.log(shade.min()) / np.log(
             shade_of(NUMBERS if numbers is None else numbers, (SIDE, SIDE)).min()
         )
-        return np.full((SIDE, SIDE), (rest2 if share >= needed - 1e-6 else given2) ** 0.5)
+        return np.full((SIDE, SIDE), (rest2 if needed - 1e-6 <= share <= 1 + 1e-6 else given2) ** 0.5)
 
     monkeypatch.setattr(module, "_shade_fitted", fit)
     monkeypatch.setattr(module, "_shade_left", left)
@@ -315,6 +315,24 @@ def test_what_is_missing_is_looked_for_where_nobody_said_what_it_is(
     image, psf = np.random.default_rng(0).random((2, 40, 48), np.float32)
     problem = Problem.of(Measurement(image, noise=0.1, **known), psf, ReconstructionOptions(**options))
     assert looked_at(problem, monkeypatch) is looks
+
+
+@pytest.mark.parametrize(("sides", "factor"), [((40, 64), 1), ((40, 65), 2), ((130, 40), 3)])
+def test_it_is_looked_for_on_64_pixels_a_side_at_most(
+    sides: tuple[int, int], factor: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked: list[int] = []
+
+    def look(_problem: Problem, _channel: int, small: int) -> None:
+        asked.append(small)
+        raise LookupError
+
+    monkeypatch.setattr(module, "_small", look)
+    image, psf = np.random.default_rng(0).random((2, *sides), np.float32)
+    with pytest.raises(LookupError):
+        with_light_restored(Problem.of(Measurement(image, noise=0.1), psf, ReconstructionOptions()))
+    assert asked == [factor]
+    assert isinstance(asked[0], int)
 
 
 def test_nothing_is_looked_for_in_volumes(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -92,10 +92,11 @@ def test_where_a_reconstruction_lies(
 
 @pytest.mark.parametrize(("distance", "is_known"), [(4.0, True), (4.1, False), (float("nan"), False)])
 def test_what_lies_farther_than_any_case_is_not_judged(distance: float, *, is_known: bool) -> None:
-    verdict = judged(Told(0.1, distance))
+    verdict = judged(Told(0.1, distance), load=0.5)
     assert (verdict.region is Region.INSIDE) == is_known
     assert judge.unlike_any(verdict) == (not is_known)
     assert ("unexplained" in verdict.sentences[-1]) == (not is_known)
+    assert not verdict.findings, "nothing brings it nearer"
 
 
 def test_a_computed_image_is_not_told_what_it_leaves_unexplained() -> None:
