@@ -8,9 +8,10 @@ from __future__ import annotations
 import contextlib
 import io
 import math
+import re
 import zipfile
 import zlib
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import IO, Any
 
@@ -219,6 +220,8 @@ _UNITS_UM = {
 }
 """Names of arrays that tell where the images of their file's stack lie, and their unit."""
 
+_LIKE_DEPTHS = re.compile(r"(?:z|depth|distance|focus|position|pos)s?(?:_?(?:nm|um|mm|cm|m))?", re.IGNORECASE)
+"""Names that somebody may have given to depths."""
 _KINDS = {"b": "booleans", "c": "complex numbers", "U": "text", "S": "text", "O": "objects of Python's"}
 _OF_FORMAT = "depths_um of its metadata"
 _SAME = 1e-6
@@ -227,11 +230,6 @@ _SAME = 1e-6
 
 class DepthsError(FileError):
     """An array that tells where images lie does not."""
-
-
-def tells_depths(path: Path) -> bool:
-    """Whether an array of an HDF5, MATLAB or .npz file tells by its name where images lie."""
-    return not _UNITS_UM.keys().isdisjoint(_shapes(path))
 
 
 def depths_told(path: Path, count: int, of_format: Any) -> tuple[list[float], tuple[str, ...]]:
@@ -249,7 +247,8 @@ def depths_told(path: Path, count: int, of_format: Any) -> tuple[list[float], tu
         return [], ()
     said: tuple[str, ...] = ()
     found: dict[str, list[float]] = {}
-    shapes = _shapes(path)
+    held = _held(path)
+    shapes = {name: shape for name, shape in held.items() if not isinstance(shape, str)}
     n_told = len(of_format) if isinstance(of_format, list) else int(of_format is not None)
     if n_told and not _of_another_stack(n_told, shapes, count):
         try:
@@ -258,13 +257,15 @@ def depths_told(path: Path, count: int, of_format: Any) -> tuple[list[float], tu
             said = (f"{error.problem.rstrip('.')}: not taken",)
     for name, um in _UNITS_UM.items():
         n_told = math.prod(shapes.get(name, (0,)))
+        if isinstance(other := held.get(name), str):
+            raise _refused(path, f"array {name}", f"is {other}", count)
         if n_told == 1:
             said = (*said, f"its array {name} is one number for {count} images: not taken")
         elif name in shapes and not _of_another_stack(n_told, shapes, count):
             what = f"array {name}"
             found[what] = _checked(path, what, _read(path, name, count), count, um)
     if not found:
-        return [], said
+        return [], (*said, *_perhaps_depths(held, count))
     first, *others = found
     for other in others:
         apart_um = np.abs(np.subtract(found[first], found[other]))
@@ -277,6 +278,16 @@ def depths_told(path: Path, count: int, of_format: Any) -> tuple[list[float], tu
                 "Leave out, or call otherwise, the one that is wrong.",
             )
     return found[first], said
+
+
+def _perhaps_depths(held: Mapping[str, tuple[int, ...] | str], count: int) -> Iterator[str]:
+    """Say which arrays could tell depths and do not, as their names are not those that do."""
+    for name, shape in held.items():
+        if name in _UNITS_UM or not _LIKE_DEPTHS.fullmatch(name):
+            continue
+        if isinstance(shape, str) or count in (math.prod(shape), *shape[:1]):
+            found = f" is {shape} and" if isinstance(shape, str) else ""
+            yield f"its {name}{found} tells no depths: numbers are taken that are called z_mm or z_um"
 
 
 def _checked(path: Path, what: str, told: Any, count: int, um: float = 1.0) -> list[float]:
@@ -323,8 +334,11 @@ def _of_another_stack(n_told: int, shapes: Mapping[str, tuple[int, ...]], count:
     return n_told != count and any(n_told in (shape[0], shape[-1]) for shape in stacks)
 
 
-def _shapes(path: Path) -> dict[str, tuple[int, ...]]:
-    """Return the shapes of a file's arrays, of any kind, by their names; empty for files of one array."""
+def _held(path: Path) -> dict[str, tuple[int, ...] | str]:
+    """Return the shapes of a file's arrays by their names, or what they are in words where that is no array.
+
+    Empty for files of one array.
+    """
     if not path.is_file():
         return {}
     with path.open("rb") as file:
@@ -332,17 +346,24 @@ def _shapes(path: Path) -> dict[str, tuple[int, ...]]:
     if is_hdf5(beginning):
         return _of_hdf5(path)
     if is_matlab(beginning):
-        return {name: array.shape for name, array in matlab.arrays_in(path).items()}
+        found = matlab.contents(path)
+        return {name: one if isinstance(one, str) else one.shape for name, one in found.items()}
     return _of_npz(path) if beginning.startswith(b"PK") else {}
 
 
-def _of_hdf5(path: Path) -> dict[str, tuple[int, ...]]:
+_MATLAB_CLASSES = {"char": "text", "cell": "a cell", "struct": "a structure", "string": "text"}
+
+
+def _of_hdf5(path: Path) -> dict[str, tuple[int, ...] | str]:
     import h5py  # the stack was read with it
 
-    found: dict[str, tuple[int, ...]] = {}
+    found: dict[str, tuple[int, ...] | str] = {}
 
     def note(name: str, entry: Any) -> None:
-        if isinstance(entry, h5py.Dataset):
+        kind = entry.attrs.get("MATLAB_class", b"")  # of version 7.3
+        if other := _MATLAB_CLASSES.get(kind.decode() if isinstance(kind, bytes) else str(kind)):
+            found[name] = other
+        elif isinstance(entry, h5py.Dataset):
             found[name] = entry.shape or ()
 
     with h5py.File(path, "r") as file:
@@ -350,8 +371,8 @@ def _of_hdf5(path: Path) -> dict[str, tuple[int, ...]]:
     return found
 
 
-def _of_npz(path: Path) -> dict[str, tuple[int, ...]]:
-    found: dict[str, tuple[int, ...]] = {}
+def _of_npz(path: Path) -> dict[str, tuple[int, ...] | str]:
+    found: dict[str, tuple[int, ...] | str] = {}
     with zipfile.ZipFile(path) as archive:
         for one in archive.infolist():
             name = one.filename.removesuffix(".npy")

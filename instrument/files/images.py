@@ -21,7 +21,7 @@ import tifffile
 
 from instrument.files import reading
 from instrument.files.atomic import protect, whole_file, write_text
-from instrument.files.decoding import DepthsError, decode, depths_told, tells_depths
+from instrument.files.decoding import DepthsError, decode, depths_told
 from instrument.files.errors import BenchError, FileError
 from instrument.files.image_folders import images_in, in_order, order_in_words
 from instrument.files.named_arrays import is_zarr, read_zarr, zarr_facts
@@ -35,17 +35,22 @@ from instrument.files.ome_tiff import (
     tiff_times,
     write_ome_tiff,
 )
-from instrument.files.pictures import ALPHA, READABLE
+from instrument.files.pictures import (
+    PLANES_AS_COLOURS,
+    PLANES_AS_IMAGES,
+    READABLE,
+    Pixels,
+    drop_alpha,
+    one_image,
+    refuse_non_finite,
+    several_images,
+    standard_dtype,
+)
 from instrument.files.seen import as_seen, levels_of, png_bytes
 from instrument.files.tiff_pages import open_tiff
 from instrument.files.tiffs import files_of
 from recon.base.arguments import require_argument, require_numbers
 from recon.errors import InputError
-
-Pixels = npt.NDArray[np.uint8] | npt.NDArray[np.uint16] | npt.NDArray[np.float32]
-
-MOST_LIGHT = 1e15
-"""No light has more counts; their squares are summed."""
 
 WRITABLE = (".tif", ".tiff", ".png", ".npy")
 
@@ -73,6 +78,11 @@ class ImageFile:
     def is_colour(self) -> bool:
         """Whether a single image has three channels."""
         return self.pixels.ndim == 3
+
+    @property
+    def colours_are_guessed(self) -> bool:
+        """Whether its three channels may as well be three images: nothing in its file tells."""
+        return PLANES_AS_COLOURS in self.notes
 
     @property
     def is_stack(self) -> bool:
@@ -112,21 +122,27 @@ def read_image(path: Path | str | ImageFile, *, holes: bool = False, several: st
 
     ``several`` is what else helps who gives a stack.
 
-    A folder with one image in it, as a photograph's run is, stands for that image.
+    A folder with one image in it, as a photograph's run is, stands for that image. Three planes of NumPy's or
+    MATLAB's are colours (:attr:`ImageFile.colours_are_guessed`), unless their file tells their depths.
 
     Raises FileError when the file is missing, another folder, empty, unreadable, no image, several images, or
     holds values that are no finite numbers.
     """
     if isinstance(path, ImageFile):
         if path.is_stack:
-            raise _several(path.path, len(path.pixels), several)
-        _refuse_non_finite(path.path, path.pixels, holes=holes)
+            raise several_images(path.path, len(path.pixels), several)
+        refuse_non_finite(path.path, path.pixels, holes=holes)
         return path
-    one = partial(_one_image, several=several)
+    one = partial(one_image, several=several)
     _, name = _array_of(Path(path))
     path, array, notes = _decoded(_only_image(Path(path)), one)
     array, more = one(path, array)
-    pixels, converted = _standard_dtype(path, array, holes=holes)
+    if (
+        PLANES_AS_COLOURS in (*notes, *more)
+        and depths_told(path, 3, image_metadata(path).get("depths_um"))[0]
+    ):
+        raise several_images(path, 3, several)
+    pixels, converted = standard_dtype(path, array, holes=holes)
     return ImageFile(path, pixels, (*notes, *more, *converted), image_metadata(path), name)
 
 
@@ -147,7 +163,7 @@ def read_stack(path: Path | str, *, leave_out: Path | None = None) -> ImageFile:
 def read(path: Path | str) -> ImageFile:
     """Read what a file holds, or a folder, ``path``: one image, or a stack. Errors as :func:`read_image`.
 
-    Three planes of NumPy's are a picture in colour, or a stack where an array beside them tells depths.
+    Three planes of NumPy's or MATLAB's are a picture in colour, or a stack where their file tells depths.
 
     Returns
     -------
@@ -171,9 +187,6 @@ def read(path: Path | str) -> ImageFile:
         except FileError:
             pass
         raise
-    if _PLANES_AS_COLOUR in image.notes and tells_depths(image.path):
-        stack = read_stack(path)
-        return stack if "depths_um" in stack.metadata else image
     return image
 
 
@@ -318,8 +331,11 @@ def _as_stack(path: Path, array: npt.NDArray[Any], notes: tuple[str, ...]) -> Im
         array = array[..., 0]
     while array.ndim > 3 and array.shape[0] == 1:
         array = array[0]
-    if array.ndim == 2 or (array.ndim == 3 and array.shape[-1] in (3, 4) and not _is_npy(path)):
-        array, more = _one_image(path, array)
+    if PLANES_AS_COLOURS in notes:
+        array, notes = np.moveaxis(array, -1, 0), tuple(note for note in notes if note != PLANES_AS_COLOURS)
+        notes += (PLANES_AS_IMAGES,)
+    if array.ndim == 2 or (array.ndim == 3 and array.shape[-1] in (3, 4)):
+        array, more = one_image(path, array)
         array = array[None]
     elif array.ndim == 4:
         array, more = drop_alpha(array)
@@ -327,7 +343,7 @@ def _as_stack(path: Path, array: npt.NDArray[Any], notes: tuple[str, ...]) -> Im
         more = ()
     else:
         raise FileError(path, f"holds an array of shape {array.shape}; a stack of images is expected.")
-    pixels, converted = _standard_dtype(path, array)
+    pixels, converted = standard_dtype(path, array)
     told = image_metadata(path) if path.is_file() or is_zarr(path) else {}
     depths, words = depths_told(path, len(pixels), told.pop("depths_um", None))
     if depths:
@@ -355,89 +371,7 @@ def _array_of(path: Path) -> tuple[Path, str]:
     return (Path(file), inside) if inside and not path.exists() else (path, "")
 
 
-# Shapes and dtypes ---------------------------------------------------------------------------------
-_PLANES_AS_COLOUR = "channels-first array taken as colour"
-
-
-def _several(path: Path, count: int, further: str) -> FileError:
-    remedy = f"Give one of them, or their mean. {further}".rstrip()
-    return FileError(path, f"holds {count} images; a single one is expected.", remedy)
-
-
-def _one_image(
-    path: Path, array: npt.NDArray[Any], several: str = ""
-) -> tuple[npt.NDArray[Any], tuple[str, ...]]:
-    notes: tuple[str, ...] = ()
-    while array.ndim > 2 and array.shape[0] == 1:
-        array = array[0]
-    if array.ndim == 3 and array.shape[0] in (3, 4) and array.shape[-1] not in (1, 2, 3, 4) and _is_npy(path):
-        array, notes = np.moveaxis(array, 0, -1), (_PLANES_AS_COLOUR,)
-    if array.ndim == 3 and array.shape[-1] in (1, 2, 3, 4):
-        array, dropped = drop_alpha(array)
-        array = array[..., 0] if array.shape[-1] == 1 else array
-        notes += dropped
-    elif array.ndim == 3:
-        raise _several(path, len(array), several)
-    elif array.ndim != 2:
-        raise FileError(path, f"holds an array of shape {array.shape}; an image is expected.")
-    if 0 in array.shape:
-        raise FileError(path, f"holds an empty array of shape {array.shape}.")
-    return array, notes
-
-
-def _is_npy(path: Path) -> bool:
-    return path.suffix.lower() in (".npy", ".npz")
-
-
-def drop_alpha(array: npt.NDArray[Any]) -> tuple[npt.NDArray[Any], tuple[str, ...]]:
-    """Return an image (..., channels) without its transparency, the second or fourth, and that in words."""
-    if array.shape[-1] in (2, 4):
-        return array[..., :-1], (ALPHA,)
-    return array, ()
-
-
-def _standard_dtype(
-    path: Path, array: npt.NDArray[Any], *, holes: bool = False
-) -> tuple[Pixels, tuple[str, ...]]:
-    """Return the pixels as uint8, uint16 or float32, unscaled, and what was converted."""
-    if array.dtype == np.bool_:
-        return array.astype(np.uint8), ("true and false taken as 1 and 0",)
-    if array.dtype.kind not in "uif":
-        raise FileError(path, f"holds {array.dtype} values; real numbers are expected.")
-    native = array.astype(array.dtype.newbyteorder("="), copy=False)
-    if native.dtype in (np.uint8, np.uint16):
-        return np.ascontiguousarray(native), ()
-    if native.dtype.kind == "f":
-        _refuse_non_finite(path, native, holes=holes)
-    elif native.size and native.min() >= 0 and native.max() <= 0xFFFF:
-        return native.astype(np.uint16), (f"{native.dtype} taken as uint16",)
-    with np.errstate(over="ignore"):
-        pixels = np.ascontiguousarray(native, np.float32)
-    _refuse_non_finite(path, pixels, holes=holes)
-    if (largest := float(np.nanmax(np.abs(pixels), initial=0))) > MOST_LIGHT:
-        raise FileError(
-            path, f"holds values up to {largest:.3g}; no light has more than {MOST_LIGHT:g} counts."
-        )
-    return pixels, () if native.dtype == np.float32 else (f"{native.dtype} taken as float32",)
-
-
-def _refuse_non_finite(path: Path, array: npt.NDArray[Any], *, holes: bool) -> None:
-    finite = np.isfinite(array)
-    if holes and finite.any():
-        finite |= np.isnan(array)
-    if not finite.all():
-        where, count = tuple(int(i) for i in np.argwhere(~finite)[0]), array.size - int(finite.sum())
-        them = (
-            "a value that is no finite number" if count == 1 else f"{count} values that are no finite numbers"
-        )
-        first = (
-            f"{array[where]} at index {where}"
-            if count == 1
-            else f"the first, {array[where]}, at index {where}"
-        )
-        raise FileError(path, f"holds {them} ({first}).", "Replace it, e.g. by the mean of its neighbours.")
-
-
+# Writing ------------------------------------------------------------------------------------------
 _BIG_TIFF_BYTES = 3_900_000_000
 
 

@@ -38,6 +38,8 @@ _TRANSFORMS_PER_MEGAPIXEL = {
 1024 x 1024 which is transformed and back; where light has to be computed first, and where it is there."""
 _ANALYSED = {"analysing": 45.0}
 """The same of steps that look at pictures of any bench, simulated or not."""
+_PER_SOLVED_MEGAPIXEL = {"blind deconvolution": 200_000.0}
+"""The same for each megapixel of the pictures that are solved, after binning: :func:`solving`."""
 _TRANSFORMS = {
     "drawing": 140.0,
     "optics": 3300.0,
@@ -51,7 +53,6 @@ _TRANSFORMS = {
     "aligning the mask": 14600.0,
     "aligning the demo's mask": 4800.0,
     "render the animal's light": 6500.0,
-    "blind deconvolution": 13000.0,
     "learning": 28000.0,
     "expose without saturating": 120.0,
     "dark frames and axial sweep": 510.0,
@@ -76,6 +77,7 @@ _ALONE = 1.2
 """Times as long as if all of it were shared among the threads."""
 _of = ""
 _megapixels = 0.0
+_solved_megapixels = 0.0
 _is_simulated = False
 _awaits_light: Callable[[], bool] = bool
 _window = False
@@ -101,6 +103,12 @@ def about(
     """
     global _of, _megapixels, _is_simulated, _awaits_light
     _of, _megapixels, _is_simulated, _awaits_light = what, megapixels, simulated, awaits_light
+
+
+def solving(megapixels: float) -> None:
+    """Say how large the pictures are, each of them, that the following step solves."""
+    global _solved_megapixels
+    _solved_megapixels = megapixels
 
 
 def place() -> Path:
@@ -129,6 +137,7 @@ def expected(what: str, count: float = 1.0) -> Expected | None:
     except (LookupError, TypeError, ValueError):
         step = what.casefold()
         transforms = _TRANSFORMS.get(step, 0.0) * count + _ANALYSED.get(step, 0.0) * _megapixels
+        transforms += _PER_SOLVED_MEGAPIXEL.get(step, 0.0) * _solved_megapixels
         if _is_simulated:
             awaited, here = _TRANSFORMS_PER_MEGAPIXEL.get(step, (0.0, 0.0))
             transforms += (awaited if _computes_light() else here) * _megapixels

@@ -1,7 +1,7 @@
 """Arrays of numbers in MATLAB files of version 5 to 7 ("MAT-File Format", MathWorks, chapter 1).
 
 Our own reader, as scipy.io's ends the program with a segmentation fault where such a file is damaged
-(scipy 1.17, found by fuzzing). Text, cells, structures, objects and sparse matrices are passed over.
+(scipy 1.17, found by fuzzing). Of text, cells, structures, objects and sparse matrices it knows the names.
 """
 
 from __future__ import annotations
@@ -26,6 +26,7 @@ _STORED = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 9: "f8
 """Kinds of stored numbers. MATLAB stores those of any class as the smallest kind that holds them all."""
 _NUMBERS = range(6, 16)
 """Classes of arrays that are numbers: double, single, and integers of 8 to 64 bits."""
+_OTHERS = {1: "a cell", 2: "a structure", 3: "an object", 4: "text", 5: "a sparse matrix"}
 _COMPLEX = 0x800
 _PIECE = 1 << 20
 _MOST_PARTS = 10_000
@@ -58,7 +59,12 @@ def arrays_in(path: Path) -> dict[str, MatlabArray]:
 
     Raises ValueError, EOFError or zlib.error when the file is damaged; OSError when it cannot be read.
     """
-    found = {}
+    return {name: array for name, array in contents(path).items() if isinstance(array, MatlabArray)}
+
+
+def contents(path: Path) -> dict[str, MatlabArray | str]:
+    """Return what a file holds by name: arrays of numbers, and what others are in words; as arrays_in."""
+    found: dict[str, MatlabArray | str] = {}
     with path.open("rb") as file:
         order = _order(file)
         for element in _elements(file, order, _HEADER, path.stat().st_size):
@@ -67,8 +73,8 @@ def arrays_in(path: Path) -> dict[str, MatlabArray]:
             with _matrix(file, order, element, _DESCRIPTION) as content:
                 described = _described(content, order)
             if described is not None:
-                name, shape, is_complex, _ = described
-                found[name] = MatlabArray(name, shape, is_complex, element)
+                name, shape, is_complex, _, other = described
+                found[name] = other or MatlabArray(name, shape, is_complex, element)
     return found
 
 
@@ -84,9 +90,9 @@ def read_array(path: Path, array: MatlabArray) -> npt.NDArray[Any]:
         order = _order(file)
         with _matrix(file, order, array.element, _DESCRIPTION + most) as content:
             described = _described(content, order)
-            if described is None:
+            if described is None or described.other:
                 raise ValueError(f"{array.name} is no array of numbers any more")
-            at = described[-1]
+            at = described.at
             numbers = []
             for _ in range(parts):
                 part = _element(content, order, at)
@@ -154,15 +160,27 @@ def _matrix(file: IO[bytes], order: str, element: _Element, most: int) -> IO[byt
     return io.BytesIO(content[inner.at :] if inner.kind == _MATRIX else b"")
 
 
-def _described(content: IO[bytes], order: str) -> tuple[str, tuple[int, ...], bool, int] | None:
-    """Return an array's name, shape, whether it is complex, and where its numbers begin; None: no numbers."""
+class _Described(NamedTuple):
+    name: str
+    shape: tuple[int, ...]
+    is_complex: bool
+    at: int
+    """Where its numbers begin."""
+    other: str
+    """What it is in words where it is no array of numbers, else empty."""
+
+
+def _described(content: IO[bytes], order: str) -> _Described | None:
+    """Return what a matrix says of itself; None where its kind is not known."""
     flags = _element(content, order, 0)
     (word,) = struct.unpack(f"{order}I", _data(content, flags)[:4])
-    if word & 0xFF not in _NUMBERS:
+    kind = word & 0xFF
+    if kind not in _NUMBERS and kind not in _OTHERS:
         return None
     sides = _element(content, order, flags.after)
     name = _element(content, order, sides.after)
     shape = tuple(int(n) for n in np.frombuffer(_data(content, sides), f"{order}i4"))
     if not 2 <= len(shape) <= 32 or min(shape) < 0:
         raise ValueError(f"it has an array of the shape {shape}")
-    return _data(content, name).decode("latin-1"), shape, bool(word & _COMPLEX), name.after
+    text = _data(content, name).decode("latin-1")
+    return _Described(text, shape, bool(word & _COMPLEX), name.after, _OTHERS.get(kind, ""))

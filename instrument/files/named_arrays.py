@@ -14,6 +14,7 @@ import numpy.typing as npt
 from instrument.files import matlab, reading
 from instrument.files.errors import FileError
 from instrument.files.ome_tiff import MICROMETRES, MOST_PLANES, SECONDS
+from instrument.files.pictures import PLANES_AS_COLOURS
 from instrument.files.pieces import (
     MOST_LZF_EXPANSION,
     hdf5_pieces,
@@ -184,8 +185,10 @@ def _chosen(
 
 
 def _of_matlab(name: str, array: npt.NDArray[Any]) -> Read:
-    """Put MATLAB's last axis, which counts images, first; three planes are a picture in colour."""
+    """Put MATLAB's last axis, which counts images, first; three planes may be colours, which is said."""
     notes = [f"the array {name} taken"]
+    if array.ndim == 3 and array.shape[-1] == 3:
+        notes.append(PLANES_AS_COLOURS)
     if array.ndim == 4 or (array.ndim == 3 and array.shape[-1] not in (1, 3)):
         array = np.moveaxis(array, -1, 0)
         notes.append(f"its last axis ({len(array)}) taken as that of the images")

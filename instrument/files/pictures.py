@@ -1,4 +1,7 @@
-"""PNG, JPEG and BMP pictures, decoded by OpenCV after a look at what their headers promise."""
+"""PNG, JPEG and BMP pictures, decoded by OpenCV after a look at what their headers promise.
+
+And what an array of any file is as a picture: which of its axes are colours, numbers as the program has them.
+"""
 
 from __future__ import annotations
 
@@ -154,3 +157,100 @@ def _sides_of_jpeg(data: bytes) -> tuple[int, int] | None:
             2 if 0xD0 <= kind <= 0xD8 or kind == 1 else 2 + int.from_bytes(data[place + 2 : place + 4], "big")
         )
     return None
+
+
+# Which axes are colours, and which numbers ---------------------------------------------------------
+Pixels = npt.NDArray[np.uint8] | npt.NDArray[np.uint16] | npt.NDArray[np.float32]
+
+MOST_LIGHT = 1e15
+"""No light has more counts; their squares are summed."""
+
+PLANES_AS_COLOURS = "its three planes taken as colours"
+"""Said of an array of NumPy's or MATLAB's of whose axes nothing tells whether they are colours or images."""
+
+PLANES_AS_IMAGES = "its three planes taken as images"
+
+
+def several_images(path: Path, count: int, further: str) -> FileError:
+    """Return what refuses a stack where an image is expected; ``further`` is what else helps."""
+    remedy = f"Give one of them, or their mean. {further}".rstrip()
+    return FileError(path, f"holds {count} images; a single one is expected.", remedy)
+
+
+def one_image(
+    path: Path, array: npt.NDArray[Any], several: str = ""
+) -> tuple[npt.NDArray[Any], tuple[str, ...]]:
+    """Return an array's only image, its colours last and without transparency, and that in words.
+
+    Raises FileError where it has several, or none.
+    """
+    notes: tuple[str, ...] = ()
+    while array.ndim > 2 and array.shape[0] == 1:
+        array = array[0]
+    if array.ndim == 3 and array.shape[0] == 3 and array.shape[-1] not in (1, 2, 3, 4) and _is_npy(path):
+        array, notes = np.moveaxis(array, 0, -1), (PLANES_AS_COLOURS,)
+    if array.ndim == 3 and array.shape[-1] in (1, 2, 3, 4):
+        array, dropped = drop_alpha(array)
+        array = array[..., 0] if array.shape[-1] == 1 else array
+        notes += dropped
+    elif array.ndim == 3:
+        raise several_images(path, len(array), several)
+    elif array.ndim != 2:
+        raise FileError(path, f"holds an array of shape {array.shape}; an image is expected.")
+    if 0 in array.shape:
+        raise FileError(path, f"holds an empty array of shape {array.shape}.")
+    return array, notes
+
+
+def _is_npy(path: Path) -> bool:
+    return path.suffix.lower() in (".npy", ".npz")
+
+
+def drop_alpha(array: npt.NDArray[Any]) -> tuple[npt.NDArray[Any], tuple[str, ...]]:
+    """Return an image (..., channels) without its transparency, the second or fourth, and that in words."""
+    if array.shape[-1] in (2, 4):
+        return array[..., :-1], (ALPHA,)
+    return array, ()
+
+
+def standard_dtype(
+    path: Path, array: npt.NDArray[Any], *, holes: bool = False
+) -> tuple[Pixels, tuple[str, ...]]:
+    """Return the pixels as uint8, uint16 or float32, unscaled, and what was converted."""
+    if array.dtype == np.bool_:
+        return array.astype(np.uint8), ("true and false taken as 1 and 0",)
+    if array.dtype.kind not in "uif":
+        raise FileError(path, f"holds {array.dtype} values; real numbers are expected.")
+    native = array.astype(array.dtype.newbyteorder("="), copy=False)
+    if native.dtype in (np.uint8, np.uint16):
+        return np.ascontiguousarray(native), ()
+    if native.dtype.kind == "f":
+        refuse_non_finite(path, native, holes=holes)
+    elif native.size and native.min() >= 0 and native.max() <= 0xFFFF:
+        return native.astype(np.uint16), (f"{native.dtype} taken as uint16",)
+    with np.errstate(over="ignore"):
+        pixels = np.ascontiguousarray(native, np.float32)
+    refuse_non_finite(path, pixels, holes=holes)
+    if (largest := float(np.nanmax(np.abs(pixels), initial=0))) > MOST_LIGHT:
+        raise FileError(
+            path, f"holds values up to {largest:.3g}; no light has more than {MOST_LIGHT:g} counts."
+        )
+    return pixels, () if native.dtype == np.float32 else (f"{native.dtype} taken as float32",)
+
+
+def refuse_non_finite(path: Path, array: npt.NDArray[Any], *, holes: bool) -> None:
+    """Refuse values that are no finite numbers; with ``holes`` some may be NaN. Raises FileError."""
+    finite = np.isfinite(array)
+    if holes and finite.any():
+        finite |= np.isnan(array)
+    if not finite.all():
+        where, count = tuple(int(i) for i in np.argwhere(~finite)[0]), array.size - int(finite.sum())
+        them = (
+            "a value that is no finite number" if count == 1 else f"{count} values that are no finite numbers"
+        )
+        first = (
+            f"{array[where]} at index {where}"
+            if count == 1
+            else f"the first, {array[where]}, at index {where}"
+        )
+        raise FileError(path, f"holds {them} ({first}).", "Replace it, e.g. by the mean of its neighbours.")

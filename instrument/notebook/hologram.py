@@ -25,7 +25,8 @@ from instrument.display.hologram import (
 from instrument.display.hologram_files import HologramFiles, hologram_figure
 from instrument.display.hologram_forecast import forecast_hologram as by_its_beginning
 from instrument.files.errors import BenchError
-from instrument.files.images import ImageFile, drop_alpha
+from instrument.files.images import ImageFile
+from instrument.files.pictures import drop_alpha
 from instrument.files.sample_images import SAMPLES
 from instrument.notebook.reconstruct import bench_config, require_hooks
 from instrument.notebook.result import figure_png, show_figure

@@ -43,8 +43,15 @@ def check_pair(
 
     ``mosaic``: the image is a colour sensor's raw frame, whose pixels are not averaged to the PSF's.
 
-    Raises FileError when no whole binning brings one to the other's shape, or their bit depths differ.
+    Raises FileError when no whole binning brings one to the other's shape, their bit depths differ, or the
+    PSF's planes may be depths as well as colours, which the image has none of.
     """
+    if psf.colours_are_guessed and not (image.is_colour or mosaic):
+        raise FileError(
+            psf.path,
+            "holds three planes; nothing tells whether these are colours or depths: the photograph is grey.",
+            "PSFs of depths are given by --volume; of colours give their mean, or a picture (TIFF, PNG).",
+        )
     psf_shape, shape = psf.pixels.shape[:2], image.pixels.shape[:2]
     if psf_shape != shape and (mosaic or whole_binnings(psf_shape, shape) is None):
         turned = " One of them may be rotated." if psf_shape == shape[::-1] else ""

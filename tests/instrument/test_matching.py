@@ -105,6 +105,25 @@ def test_of_a_psf_with_colours_a_grey_photograph_takes_the_mean(pair: tuple[Pixe
     assert "their mean is taken" in by_folder.warnings[0]
 
 
+def test_three_planes_that_may_be_depths_are_no_psf_of_a_grey_photograph(
+    pair: tuple[Pixels, Pixels], tmp_path: Path
+) -> None:
+    psf, photograph = pair
+    file = tmp_path / "psf.npy"
+    np.save(file, np.stack([psf, np.roll(psf, 3, axis=0), np.roll(psf, 5, axis=1)]))
+    image = ImageFile(Path("raw.tif"), photograph)
+    asked = InputOptions(binning=1, erasures="none", dark=100.0)
+    with pytest.raises(FileError, match=r"nothing tells whether .* given by --volume"):
+        job_from_files(file, image, asked)
+    colour = ImageFile(Path("raw.tif"), np.stack([photograph] * 3, axis=-1))
+    made = job_from_files(file, colour, asked)
+    assert made.calibration.psfs.shape[1] == 3
+    assert "its three planes taken as colours" in made.notes["PSF"]
+    (tmp_path / "psf.json").write_text('{"depths_um": [1e4, 2e4, 3e4]}')
+    with pytest.raises(FileError, match=r"holds 3 images; .* --volume"):
+        job_from_files(file, colour, asked)
+
+
 @pytest.mark.parametrize(
     ("psf", "image", "binnings"),
     [

@@ -13,7 +13,7 @@ import pytest
 import scipy.io
 
 from instrument.files.errors import FileError
-from instrument.files.images import ImageFile, read, read_stack
+from instrument.files.images import ImageFile, read, read_image, read_stack
 
 STACK = np.random.default_rng(0).integers(0, 999, (5, 20, 30)).astype(np.uint16)
 
@@ -42,7 +42,7 @@ def written(folder: Path, suffix: str, **arrays: Any) -> str:
         ("z_um", np.array([1, 2, 3, 4, 5j]), "it .*complex|it cannot be read as such"),
         ("z_um", np.arange(4.0), "it has (1 x )?4 of them"),
         ("z_um", np.arange(10.0).reshape(5, 2), "it has 5 x 2 of them"),
-        ("z_um", np.array(list("abcde")), "it holds text|it cannot be read as such"),
+        ("z_um", np.array(list("abcde")), "it (holds|is) text|it cannot be read as such"),
         ("z_um", np.array([True, False, True, False, True]), "it holds booleans|it cannot be read as such"),
         ("z_um", np.array([1, None, 3, 4, 5], object), "it cannot be read as such: .* objects of Python's"),
     ],
@@ -50,7 +50,7 @@ def written(folder: Path, suffix: str, **arrays: Any) -> str:
 def test_depths_that_are_none_are_refused_by_the_arrays_name(
     tmp_path: Path, suffix: str, name: str, told: npt.NDArray[Any], found: str
 ) -> None:
-    if (suffix, told.dtype.kind) in ((".h5", "O"), (".mat", "O"), (".mat", "U"), (".mat", "b")):
+    if (suffix, told.dtype.kind) in ((".h5", "O"), (".mat", "O"), (".mat", "b")):
         return  # the format has none, or does not tell it from others
     file = written(tmp_path, suffix, **{name: told})
     with pytest.raises(FileError, match=f"its array {name} .* 5 finite numbers are expected, and {found}"):
@@ -110,6 +110,56 @@ def test_three_planes_with_their_depths_beside_them_are_no_colours(tmp_path: Pat
     assert read(f"{tmp_path / 'a.npz'}::psfs").is_colour
     np.savez(tmp_path / "a.npz", psfs=three, z_mm=[10.0, 20.0, 35.0])
     assert read(f"{tmp_path / 'a.npz'}::psfs").metadata["depths_um"] == [1e4, 2e4, 3.5e4]
+    with pytest.raises(FileError, match="holds 3 images; a single one is expected"):
+        read_image(f"{tmp_path / 'a.npz'}::psfs")
     np.savez(tmp_path / "a.npz", psfs=three, z_mm=[10.0, 20.0, 35.0, 40.0])
     with pytest.raises(FileError, match=r"its array z_mm .* 3 finite numbers are expected, and it has 4"):
         read(f"{tmp_path / 'a.npz'}::psfs")
+
+
+@pytest.mark.parametrize("version", ["5", "7.3"])
+def test_matlabs_texts_and_cells_that_are_called_depths_are_not_passed_over(
+    tmp_path: Path, version: str
+) -> None:
+    cell = np.empty((1, 5), object)
+    cell[0] = [f"{z} mm" for z in (10, 20, 30, 40, 50)]
+
+    def holding(**others: Any) -> str:
+        path = tmp_path / "a.mat"
+        stack = np.moveaxis(STACK, 0, -1)
+        if version == "5":
+            scipy.io.savemat(path, {"psfs": stack, **others})
+            return f"{path}::psfs"
+        path.unlink(missing_ok=True)
+        with h5py.File(path, "w") as file:
+            file["psfs"] = stack.T
+            for name, other in others.items():
+                file[name] = np.full((5, 1), 77, np.uint16)
+                file[name].attrs["MATLAB_class"] = np.bytes_("cell" if other is cell else "char")
+        return f"{path}::psfs"
+
+    for told, words in ((cell, "a cell"), ("abcde", "text")):
+        with pytest.raises(FileError, match=f"its array z_mm tells where the images lie, .* it is {words}"):
+            read_stack(holding(z_mm=told))
+        for name in ("depths", "Z", "z_cm"):
+            said = (
+                f"its {name} is {words} and tells no depths: numbers are taken that are called z_mm or z_um"
+            )
+            assert said in read_stack(holding(**{name: told})).notes
+
+
+def test_numbers_that_may_be_depths_and_are_not_called_so_are_named(tmp_path: Path) -> None:
+    stack = read_stack(
+        written(tmp_path, ".npz", z=np.arange(5.0), pos_nm=np.arange(4.0), gain=np.arange(5.0))
+    )
+    told = [note for note in stack.notes if "tells no depths" in note]
+    assert told == ["its z tells no depths: numbers are taken that are called z_mm or z_um"]
+
+
+def test_three_planes_of_matlabs_are_images_where_a_stack_is_asked_for(tmp_path: Path) -> None:
+    three = np.moveaxis(STACK[:3], 0, -1)
+    scipy.io.savemat(tmp_path / "a.mat", {"psfs": three})
+    assert read(tmp_path / "a.mat").is_colour
+    np.testing.assert_array_equal(read_stack(tmp_path / "a.mat").pixels, STACK[:3])
+    scipy.io.savemat(tmp_path / "a.mat", {"psfs": three, "z_mm": [10.0, 20.0, 35.0]})
+    assert read(f"{tmp_path / 'a.mat'}::psfs").metadata["depths_um"] == [1e4, 2e4, 3.5e4]
