@@ -39,6 +39,11 @@ FRAMES = 4
 """Of each block that is tried: one that begins cold, and three that go on."""
 SHOWN = 40
 """Pictures of an MP4 that tell what one takes: VP9 keeps 25 before it writes."""
+GIVEN_BACK = 4 * 2**20
+"""Bytes that solving frees and the C library gives back before the MP4 is written, or not.
+
+The same film goes one way or the other, the trial the dearer one (docs/benchmarks/time-told.md).
+"""
 
 
 @dataclass(frozen=True)
@@ -115,6 +120,7 @@ def forecast_video(
         counted=True,
         each="frame",
         where=f" in each of {count(workers, 'worker')}" if elsewhere else "",
+        memory_less_bytes=GIVEN_BACK if video.film and not elsewhere else 0.0,
     )
 
 
