@@ -15,6 +15,7 @@ import numpy.typing as npt
 
 from recon.base import fft
 from recon.base.arguments import require_numbers, require_shape
+from recon.base.checks import require_finite
 from recon.base.threads import in_blocks
 from recon.camera.base import Array, LinearOperator
 from recon.errors import InputError
@@ -116,6 +117,8 @@ class Convolution(LinearOperator):
             raise InputError(f"psfs must be ([n_z, ]n_channels, height, width), not {psfs.shape}.")
         if len(psfs) == 0:
             raise InputError("The list of depths is empty: a volume needs at least one PSF.")
+        if not np.isfinite(float(psfs.sum(dtype=np.float64))):
+            require_finite(psfs, "PSF")
         self.is_picture = psfs.ndim == 3
         self._psfs = psfs[None] if self.is_picture else psfs
         self.n_z, own_channels, *psf_shape = self._psfs.shape

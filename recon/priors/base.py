@@ -20,12 +20,14 @@ Array = npt.NDArray[Any]
 def refuse_lookalike(prior: object) -> None:
     """Raise InputError for what has a prior's methods and is none, saying how it becomes one."""
     made = prior if isinstance(prior, type) else type(prior)
-    if issubclass(made, Prior) or not (hasattr(made, "value") and hasattr(made, "prox")):
+    has = [method for method in ("value", "prox") if hasattr(made, method)]
+    if issubclass(made, Prior) or not has:
         return
     name = made.__name__
+    which, lacks = ("value and prox", "") if len(has) == 2 else (f"{has[0]} alone", " with value and prox")
     raise InputError(
-        f"prior must be a Prior, and {name}, which has value and prox, is none: derive its class, "
-        f"class {name}(db.Prior), and give an object, {name}(...)."
+        f"prior must be a Prior, and {name}, which has {which}, is none: derive its class, "
+        f"class {name}(db.Prior){lacks}, and give an object, {name}(...)."
     )
 
 
@@ -56,15 +58,29 @@ class Prior(ABC):
         """Return ``argmin_p  step * value(p) + 1/2 ||p - x||^2``. ``x`` is left as it is."""
 
     def checked_prox(self, x: Array, step: float) -> Array:
-        """Return ``prox``; InputError where a prior of one's own gives no array like ``x``."""
-        found = self.prox(x, step)
+        """Return ``prox``; InputError where a prior of one's own gives no real array like ``x``.
+
+        A prior of one's own may write into what it is given: it is a copy of the solver's.
+        """
+        found = self.prox(x if type(self).__module__.startswith("recon.") else x.copy(), step)
         if getattr(found, "shape", None) != x.shape:
             given = f"an array {found.shape}" if hasattr(found, "shape") else type(found).__name__
-            raise InputError(
-                f"The prior {type(self).__name__}: its prox must return an array like its argument, "
-                f"{x.shape}, not {given}."
-            )
+            raise self._refused(f"its prox must return an array like its argument, {x.shape}, not {given}")
+        if found.dtype.kind == "c" != x.dtype.kind:
+            raise self._refused(f"its prox must return real numbers as its argument has, not {found.dtype}")
         return found
+
+    def checked_value(self, x: Array) -> float:
+        """Return ``value``; InputError where a prior of one's own gives no real number."""
+        value = self.value(x)
+        if getattr(value, "shape", ()) != () or value is None or isinstance(value, complex):
+            shape = getattr(value, "shape", ())
+            given = f"an array {shape}" if shape else type(value).__name__
+            raise self._refused(f"its value must return a real number, not {given}")
+        return value
+
+    def _refused(self, problem: str) -> InputError:
+        return InputError(f"The prior {type(self).__name__}: {problem}.")
 
     def for_a_run(self) -> Self:
         """Return the prior with a memory of its own: what a prox keeps belongs to one run."""

@@ -190,7 +190,7 @@ class DouglasRachford(VolumeSplitting):
         u = self.prior.checked_prox((state + 2 * d)[None], self.gamma)[0].astype(state.dtype, copy=False)
         r = u - state - d
         self.z = state + f(self.relaxation) * r
-        sums = np.array([self.prior.value(u[None]), squares(r), squares(u), squares(d)])
+        sums = np.array([self.prior.checked_value(u[None]), squares(r), squares(u), squares(d)])
         return (self._transfer * fft.rfft(self.z)).sum(axis=0), sums
 
     def _back_projection(self) -> Array:

@@ -100,7 +100,7 @@ class Fista(Solver):
         residual = float(np.linalg.norm(self.forward_x - self.data))
         if not np.isfinite(residual):
             residual = np.inf  # NaN would mean "not known", and a prox may make zeros of it
-        objective = 0.5 * residual**2 + self.prior.value(self.x)
+        objective = 0.5 * residual**2 + self.prior.checked_value(self.x)
         grew = objective > self.objective
         self.objective = objective
         restart = (self.restart == "gradient" and against) or (self.restart == "function" and grew)

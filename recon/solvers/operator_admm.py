@@ -209,7 +209,7 @@ class OperatorAdmm(ExactAdmm):
         self.x += back
 
     def _value(self) -> float:
-        return self._l1 + sum(split.prior.value(split.split) for split in self.splits[1:])
+        return self._l1 + sum(split.prior.checked_value(split.split) for split in self.splits[1:])
 
 
 def _is_not_periodic(tv: TotalVariation) -> bool:

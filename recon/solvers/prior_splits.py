@@ -232,7 +232,7 @@ class PriorSplits:
         """Return the prior's value at the last sweep's iterates (finite: bounds hold by construction)."""
         k, s = self._kernels, self.channel_sums().sum(axis=0)
         weight = self.tv.weight if self.tv else 0.0
-        others = sum(other.prior.value(other.split) for other in self.others)
+        others = sum(other.prior.checked_value(other.split) for other in self.others)
         return float(weight * s[k.TV] + self.separable.weight * s[k.L1] + others)
 
     def balanced_penalties(self) -> Array:

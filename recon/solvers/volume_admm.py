@@ -196,7 +196,7 @@ class ExactAdmm(VolumeSplitting):
 
     def _value(self) -> float:
         """Value of the priors other than total variation, of their split variables."""
-        return sum(one.prior.value(one.split) for one in self.splits)
+        return sum(one.prior.checked_value(one.split) for one in self.splits)
 
     @property
     def _solved(self) -> Array:

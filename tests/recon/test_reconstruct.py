@@ -222,6 +222,13 @@ GOOD = np.ones((12, 14)) + np.eye(12, 14)
 BAD = np.where(np.arange(12 * 14).reshape(12, 14) == 30, np.nan, GOOD)
 
 
+class ValueAlone:
+    """Half a prior."""
+
+    def value(self, x):
+        return 0.0
+
+
 class LikeAPrior:
     """Has a prior's methods and is none."""
 
@@ -283,6 +290,12 @@ class LikeAPrior:
             r"LikeAPrior, .* is none: derive .* class LikeAPrior\(db.Prior\)",
         ),
         (GOOD, GOOD, {"prior": LikeAPrior}, "LikeAPrior, which has value and prox, is none"),
+        (
+            GOOD,
+            GOOD,
+            {"prior": ValueAlone()},
+            r"ValueAlone, which has value alone, is none: .*\(db.Prior\) with value and prox",
+        ),
         ("photo.tif", GOOD, {}, r"must be an array, .* not 'photo.tif'\. db.read reads a file"),
         (None, GOOD, {}, r"must be an array, .* not None\.$"),
         (GOOD, GOOD, {"field": "half"}, "field must be one of sensor, full, not 'half'"),

@@ -14,6 +14,7 @@ from recon.errors import InputError, StructureError
 from recon.priors import L1, Box, HaarTotalVariation, NonNegativity, TotalVariation
 from recon.priors.base import Prior, Separable, require_weight
 from recon.priors.total_variation import Differences
+from recon.solvers.admm import Admm
 from recon.solvers.base import StoppingRules
 from recon.solvers.douglas_rachford import SparseDouglasRachford
 from recon.solvers.fista import Fista
@@ -34,6 +35,39 @@ class Cropping(L1):
 
     def prox(self, x: np.ndarray, step: float) -> np.ndarray:
         return super().prox(x, step)[..., :2]
+
+
+class Complex(L1):
+    """Filters in the frequency domain, and keeps what comes back."""
+
+    def prox(self, x: np.ndarray, step: float) -> np.ndarray:
+        return super().prox(x, step) + 0j
+
+
+class Valued(L1):
+    """Has a value a pixel, or none at all."""
+
+    def __init__(self, value: object) -> None:
+        super().__init__(0.1)
+        self.told = value
+
+    def value(self, x: np.ndarray) -> float:
+        return self.told  # type: ignore[return-value]
+
+
+class Plain(L1):
+    """As it is, and not known for what it is."""
+
+    def joined(self, other: Prior) -> Prior | None:
+        return None
+
+
+class InPlace(Plain):
+    """Writes its prox over what it is given."""
+
+    def prox(self, x: np.ndarray, step: float) -> np.ndarray:
+        x[:] = super().prox(x, step)
+        return x
 
 
 class Bare(LinearOperator):
@@ -69,6 +103,11 @@ REFUSED: list[tuple[Callable[[], object], type[Exception], str]] = [
     (lambda: volume(Separable(0.1, lower=-1.0)), StructureError, "for l1 and non-negativity alone"),
     (lambda: require_exact(L1(0.1), HaarTotalVariation(0.1)), StructureError, "HaarTotalVariation is only"),
     (lambda: of_own(Cropping(0.1)), InputError, "Cropping: its prox must return an array like its argument"),
+    (lambda: of_own(Complex(0.1)), InputError, "Complex: its prox must return real numbers as its argument"),
+    (lambda: of_own(Valued(np.ones((3, 4)))), InputError, "a real number, not an array (3, 4)"),
+    (lambda: of_own(Valued(None)), InputError, "value must return a real number, not NoneType"),
+    (lambda: of_own(Valued(1j)), InputError, "value must return a real number, not complex"),
+    (lambda: Convolution(np.full((1, 5, 6), np.nan), (8, 9)), InputError, "The PSF holds 30 values"),
     (lambda: of_own(L1(0.1), Bare()), AttributeError, "Bare has no range_shape: its __init__ must call"),
     (lambda: L1(-0.1), ValueError, "must be a number, 0 or more, not -0.1"),
     (lambda: require_weight(float("nan")), ValueError, "must be a number, 0 or more, not nan"),
@@ -105,3 +144,12 @@ def test_a_pair_of_differences_is_shrunk_by_its_length_or_each_by_itself() -> No
     np.testing.assert_allclose(together, [[2.4, 0, 0], [-3.2, 0, 0]])
     each = soft_pair(tx, ty, 0.35, isotropic=False)
     np.testing.assert_allclose(each, [[2.65, 0, 0], [-3.65, 0.05, 0]], atol=1e-12)
+
+
+def test_a_prior_of_ones_own_may_write_into_its_argument() -> None:
+    camera = Convolution(PSFS[:1, 0], (8, 9), dtype=np.float64)
+    own, ours = (
+        Admm(camera, DATA, prior + NonNegativity()).run(StoppingRules(5)).solution
+        for prior in (InPlace(0.1), Plain(0.1))
+    )
+    np.testing.assert_array_equal(own, ours)
