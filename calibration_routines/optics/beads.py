@@ -27,6 +27,7 @@ from calibration_routines.purpose import CalibrationError
 from calibration_routines.routine import Routine
 from instrument.bench.bench import Bench
 from instrument.bench.camera_settings import restore_camera
+from instrument.files import kept_times
 from instrument.files.atomic import named_by_worth
 from instrument.files.calibration_file import save_calibration
 from instrument.files.record import plain
@@ -227,6 +228,7 @@ def _photograph_and_solve(
     facts: dict[str, Any] = {"bench": bench.label, "simulated": bool(bench.simulated_kinds)}
     listener.step("photographing bead slides")
     taken = photograph_slides(bench, slides, folder, control, listener, begun)
+    kept_times.solving(taken.images[0].size / 1e6)
     listener.step("blind deconvolution")
 
     def solving(_words: str, done: float) -> None:

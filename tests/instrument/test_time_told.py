@@ -133,6 +133,19 @@ def test_what_takes_long_is_told_the_first_time_too_each_of_what_it_counts(
     assert kept_times.expected("analysing") is None, "a moment"
 
 
+def test_what_solves_pictures_is_told_by_how_large_they_are(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(kept_times, "transform_s", lambda: 0.01)
+    monkeypatch.setattr(os, "getloadavg", lambda: (0.0, 0.0, 0.0))
+    kept_times.about("calibrate", megapixels=5.5)
+    told = []
+    for megapixels in (0.02, 0.35):
+        kept_times.solving(megapixels)
+        expected = kept_times.expected("blind deconvolution")
+        assert expected is not None
+        told.append(expected.seconds / megapixels)
+    assert told[0] == pytest.approx(told[1])
+
+
 def test_a_step_of_several_parts_is_expected_to_take_as_long_until_the_first_is_done() -> None:
     kept_times.about("compare")
     kept_times.remember("compare: comparing of 100", 50.0)
