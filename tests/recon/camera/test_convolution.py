@@ -23,8 +23,14 @@ def dot_test(operator, rtol, seed=0):
 @pytest.mark.parametrize(("dtype", "rtol"), [(np.float32, 1e-6), (np.float64, 1e-14)])
 @pytest.mark.parametrize(
     ("psf_shape", "sensor", "n_z", "channels"),
-    [((7, 6), (9, 11), 3, 1), ((12, 13), (5, 4), 2, 3), ((1, 1), (1, 1), 1, 1), ((8, 8), (8, 8), 11, 2)],
-    ids=["odd", "PSF larger than sensor", "one pixel", "many planes"],
+    [
+        ((7, 6), (9, 11), 3, 1),
+        ((12, 13), (5, 4), 2, 3),
+        ((1, 1), (1, 1), 1, 1),
+        ((8, 8), (8, 8), 11, 2),
+        ((5, 6), (7, 8), 1, 2),
+    ],
+    ids=["odd", "PSF larger than sensor", "one pixel", "many planes", "one plane"],
 )
 def test_adjoint(psf_shape, sensor, n_z, channels, dtype, rtol):
     psfs = np.random.default_rng(1).random((n_z, 1, *psf_shape)).astype(dtype)

@@ -166,6 +166,12 @@ def test_a_point_moves_half_a_pixel_at_once_at_most() -> None:
         left = seen.image(points((0.2, 0.0, light))) - seen.image(points((0, 0, light)))
         near, _ = _refined(seen, left, np.zeros(2), light)
         assert near[0] == pytest.approx(0.2, abs=0.02)
+    left = seen.image(points((0.2, 0.0, 1.0))) - seen.image(points((0, 0, 1.0)))
+    tried: list[np.ndarray] = []
+    patch = seen.patch
+    seen.patch = lambda place, **how: tried.append(place) or patch(place, **how)  # type: ignore[method-assign, func-returns-value]
+    _refined(seen, left, np.zeros(2), 1.0)
+    assert len(tried) == 2, "a move that gained is made, and no other tried"
 
 
 def test_a_move_that_gains_nothing_is_halved_twice_and_given_up() -> None:
