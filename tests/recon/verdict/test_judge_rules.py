@@ -99,6 +99,16 @@ def test_what_lies_farther_than_any_case_is_not_judged(distance: float, *, is_kn
     assert not verdict.findings, "nothing brings it nearer"
 
 
+def test_what_sets_it_apart_from_all_cases_is_named() -> None:
+    told = Told(0.1)
+    load = told.features.index("load")
+    told.distance = lambda place: 5 * abs(float(place[load] - told.typical[load]))  # type: ignore[method-assign]
+    verdict = judged(told, load=0.5)
+    assert verdict.region is Region.UNKNOWN
+    assert verdict.sentences[1].startswith("What sets it apart: 0.5 unknowns for each measured pixel")
+    assert verdict.findings[0].gain == pytest.approx(5 * np.log(0.505 / 0.055), rel=1e-3)
+
+
 def test_a_computed_image_is_not_told_what_it_leaves_unexplained() -> None:
     verdict = judged(Told(0.1), signal=1000.0, unexplained=0.001)
     assert not judge.unlike_any(verdict)
