@@ -34,7 +34,7 @@ from gui.widgets.dialogues import Question, TextWindow
 from gui.widgets.entry import NumberEdit
 from gui.widgets.status_line import StatusLine
 from gui.widgets.step_strip import StepStrip
-from gui.widgets.tab_order import stops_of
+from gui.widgets.tab_order import Kept, stops_of
 from instrument.bench.config import BenchConfig, Kind
 
 _AREAS = {
@@ -77,6 +77,7 @@ class MainWindow(QMainWindow):
         self._panels = self.maker.panels
         self._docks: dict[str, QDockWidget] = {}
         self._restyling: Generator[str | None] | None = None
+        self._kept = Kept(self)
         self._may_close = False
         self.question: Question | None = None
         """The question that was asked last, while it is open."""
@@ -341,9 +342,13 @@ class MainWindow(QMainWindow):
         """Go on by Tab from stop to stop.
 
         Qt's own way stops at parts that hand the keyboard on to another as well, wherever they are in its
-        order: it went round within a panel, and never came to STOP.
+        order: it went round within a panel, and never came to STOP. And it goes on from a part that is put
+        off while it works, to a field that takes what is typed then: the keyboard waits until it is on again.
         """
         stops, now = list(stops_of(self)), QApplication.focusWidget()
+        if now is not None and not now.isEnabled():
+            self._kept.keep(now)
+            return False
         if now not in stops:
             return super().focusNextPrevChild(forward)
         reason = Qt.FocusReason.TabFocusReason if forward else Qt.FocusReason.BacktabFocusReason

@@ -5,9 +5,10 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from itertools import pairwise
 
-from PySide6.QtCore import Qt
+from PySide6.QtCore import QEvent, QObject, Qt
 from PySide6.QtWidgets import (
     QAbstractScrollArea,
+    QApplication,
     QComboBox,
     QFormLayout,
     QLayout,
@@ -41,6 +42,26 @@ def take_turns(on: Sequence[QWidget], off: Sequence[QWidget]) -> None:
         on[0].setFocus()
     for part in off:
         part.setEnabled(False)
+
+
+class Kept(QObject):
+    """Keeps the keyboard's place while the part that had it is off: keys go to no field beside it."""
+
+    part: QWidget | None = None
+
+    def keep(self, part: QWidget) -> None:
+        """Give the keyboard back to a part as soon as it is on again, unless another has it by then."""
+        self.part = part
+        part.installEventFilter(self)
+
+    def eventFilter(self, watched: QObject, event: QEvent) -> bool:  # noqa: N802 - Qt's name
+        """See the part that had the keyboard come back."""
+        if event.type() == QEvent.Type.EnabledChange and isinstance(watched, QWidget) and watched.isEnabled():
+            watched.removeEventFilter(self)
+            if self.part is watched and QApplication.focusWidget() is None:
+                watched.setFocus()
+            self.part = None
+        return False
 
 
 def stops_of(window: QWidget) -> Iterator[QWidget]:

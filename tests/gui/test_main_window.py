@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 from PySide6.QtCore import QSettings, Qt
 from PySide6.QtGui import QColor
-from PySide6.QtWidgets import QApplication, QLabel, QMessageBox, QWidget
+from PySide6.QtWidgets import QApplication, QLabel, QMessageBox, QPushButton, QWidget
 from pytestqt.qtbot import QtBot
 
 from benchmarks.gui_stalls import opened
@@ -449,3 +449,21 @@ def test_the_benchmark_of_stalls_tells_of_a_panel_that_is_not_made(
     monkeypatch.setattr(PanelEntry, "load", lambda _: threading.Event().wait(1.0))
     with pytest.raises(TimeoutError, match=r"Holograms does not stand.*the job that imports it.*Opening"):
         opened(window, "holograms", 0.2)
+
+
+def test_what_is_typed_while_a_button_works_goes_into_no_field(qtbot: QtBot, window: MainWindow) -> None:
+    """After *Auto* the keyboard was in *Gain*, its number selected."""
+    window.activateWindow()
+    qtbot.waitUntil(window.isActiveWindow, timeout=WAIT_MS)
+    live = window.show_panel("live")
+    auto = next(b for b in live.findChildren(QPushButton) if b.text() == "Auto")
+    qtbot.waitUntil(auto.isEnabled, timeout=WAIT_MS)
+    auto.setFocus()
+    auto.setEnabled(False)
+    assert QApplication.focusWidget() is None
+    auto.setEnabled(True)
+    assert auto.hasFocus(), "it has done its work"
+    auto.setEnabled(False)
+    window.stop_button.setFocus()
+    auto.setEnabled(True)
+    assert window.stop_button.hasFocus(), "the operator went on meanwhile"
