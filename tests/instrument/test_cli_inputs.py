@@ -241,7 +241,7 @@ _WHOLE = {"whole_file", "whole_folder", "draft_folder"}
 _GIVEN_A_DRAFT = """
 activity: write_activity_figure|atomic: clear_left|atomic: draft_folder|atomic: whole_file
 calibration_file: _write|calibration_file: _write_ome_zarr|export: _npy|export: _tiff|images: _write_png
-images: _write_ome_tiff|images: _write_tiff|opening: _open_zarr|result: figure_png"""
+images: _write_tiff|ome_tiff: write_ome_tiff|opening: _open_zarr|result: figure_png"""
 _IN_A_FOLDER_OF_ITS_OWN = """
 checkpointing: CheckpointFolder.remove|display: run_display_demo|frame_array: FrameArray._write_draft
 frame_array: FrameArray.remove_draft|frame_array: FrameArray.remove_half_written|frame_array: FrameArray.write
