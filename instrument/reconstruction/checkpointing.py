@@ -141,12 +141,12 @@ class CheckpointFolder:
         self._kept = False
         self.left_aside: tuple[str, ...] = ()
         problem = plain(dict(problem))
-        refuse_input(folder)  # in the end all of it is removed
         if folder.exists() and not folder.is_dir():
             raise FileError(
                 folder, "is a file; a checkpoint is a folder.", "Name another, or one to be made."
             )
         if (folder / PROBLEM).is_file():
+            refuse_input(folder)  # in the end all of it is removed
             self._compare(problem)
         elif folder.is_dir() and any(folder.iterdir()):
             raise FileError(folder, "holds something else and was left as it is.", "Name another folder.")
