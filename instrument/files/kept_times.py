@@ -38,8 +38,8 @@ _TRANSFORMS_PER_MEGAPIXEL = {
 1024 x 1024 which is transformed and back; where light has to be computed first, and where it is there."""
 _ANALYSED = {"analysing": 45.0}
 """The same of steps that look at pictures of any bench, simulated or not."""
-_PER_SOLVED_MEGAPIXEL = {"blind deconvolution": 200_000.0}
-"""The same for each megapixel of the pictures that are solved, after binning: :func:`solving`."""
+_PER_SOLVED_MEGAPIXEL = {"blind deconvolution": 150_000.0}
+"""What comes on top for each megapixel of the pictures that are solved, after binning: :func:`solving`."""
 _TRANSFORMS = {
     "drawing": 140.0,
     "optics": 3300.0,
@@ -53,6 +53,7 @@ _TRANSFORMS = {
     "aligning the mask": 14600.0,
     "aligning the demo's mask": 4800.0,
     "render the animal's light": 6500.0,
+    "blind deconvolution": 1500.0,
     "learning": 28000.0,
     "expose without saturating": 120.0,
     "dark frames and axial sweep": 510.0,
