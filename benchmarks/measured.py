@@ -26,7 +26,7 @@ import numpy.typing as npt
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from benchmarks.measured_blind import blind
-from benchmarks.measured_labs import labs
+from benchmarks.measured_labs import cut, labs
 from benchmarks.measured_variants import coarse_pairs, dark_levels, variants
 from benchmarks.uncertainty import measured_pairs_held
 from recon import Calibration, Reconstruction, reconstruct
@@ -277,6 +277,7 @@ SECTIONS: Mapping[str, tuple[str, Callable[[Path], list[str]]]] = {
     "variants": ("The hand as other files are", variants),
     "blind": ("The hand as a stranger gives it", blind),
     "labs": ("The hand by other laboratories' habits", labs),
+    "cut": ("What tells that the hand's PSF was cut", cut),
     "coarse": ("Pairs in coarse pixels", coarse_pairs),
     "dark": ("Pairs whose dark level is wrong", dark_levels),
     "intervals": ("How far the pairs' pictures may be off", intervals),

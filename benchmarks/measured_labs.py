@@ -10,7 +10,11 @@ import numpy as np
 import numpy.typing as npt
 
 from benchmarks.measured_blind import Case, dusty, on_a_slope, rows_of, window
-from benchmarks.measured_variants import FULL, columns, compressed, counts, light, middle
+from benchmarks.measured_variants import BINNING, FULL, alike, columns, compressed, counts, light, middle
+from recon import reconstruct
+from recon.base.blocks import block_mean
+from recon.evaluation.measured_sets import measured_set
+from recon.reconstruction.result import window_of
 
 Array = npt.NDArray[Any]
 
@@ -107,3 +111,43 @@ LABS: Mapping[str, Case] = {
 def labs(_: Path) -> list[str]:
     """Show what becomes of the hand by defaults and by the plain ADMM on what its owner would have mended."""
     return rows_of(LABS)
+
+
+PLACES = ((0, 0), (1, 1), (0, 1), (1, 0), (0.5, 0), (0, 0.5), (0.5, 1), (1, 0.5))
+"""Of windows beside the middle: corners and sides."""
+EDGE = 0.04
+"""Width of a PSF's edge, relative to its shorter side."""
+
+
+def cut(_: Path) -> list[str]:
+    """Show what tells a PSF that was cut with its photograph: light at its edges, and beyond the field."""
+    psfs, photograph = measured_set("hand")
+    psf, seen = block_mean(psfs[0], BINNING), block_mean(photograph, BINNING)
+    truth = reconstruct(seen, psf, solver="admm-sensor", iterations=400, tolerance=1e-5, judged=False).image
+    central = [(share, 0.5, 0.5) for share in (1, 0.85, 0.7, 0.6, 0.5, 0.4)]
+    beside = [(share, *place) for share in (0.7, 0.5) for place in PLACES]
+    lines = [
+        f"Both cut, bin {BINNING}; edge: light of the PSF's outer {EDGE:.0%}, relative to its mean; beyond: "
+        "share of the light that was found beyond the sensor's field.",
+        "",
+        "| window's sides, down, across | dB | correlation | edge | beyond | verdict |",
+        "|---|---|---|---|---|---|",
+    ]
+    for share, down, across in (*central, *beside):
+        one, data, picture = (window(a, share, down, across) for a in (psf, seen, truth))
+        result = reconstruct(data, one)
+        decibels, correlation = alike(result.image, picture)
+        assert result.state is not None
+        assert result.verdict is not None
+        (rows, columns), _ = window_of("sensor", data.shape, one.shape)
+        lit = np.maximum(result.state, 0)
+        beyond = 1 - lit[..., rows, columns].sum() / lit.sum()
+        wide = round(EDGE * min(one.shape))
+        inner = one[wide:-wide, wide:-wide]
+        edge = (one.sum() - inner.sum()) / (one.size - inner.size) / one.mean()
+        lines.append(
+            f"| {share:g}, {down:g}, {across:g} | {decibels:.1f} | {correlation:.3f} | {edge:.2f} | "
+            f"{beyond:.2f} | {result.verdict.sentences[0].split(':')[0]} |"
+        )
+        print(lines[-1], flush=True)
+    return lines
