@@ -13,6 +13,7 @@ from pydantic import ValidationError
 from drivers.composite_stage import CompositeOptions, CompositeStage
 from drivers.device import SharedPart
 from drivers.errors import DeviceError, DeviceTimeoutError, LimitError, StoppedError
+from drivers.grbl.stage import GrblStage
 from drivers.testing.stage import StageContract
 from drivers.zaber.stage import ZaberOptions, ZaberStage
 from tests.mocks.grbl_controller import GrblController
@@ -26,7 +27,10 @@ ROTATIONS = {
 
 
 @pytest.fixture
-def board(tmp_path: Path) -> Iterator[GrblController]:
+def board(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[GrblController]:
+    # A controller on a busy machine is waited for; tests of silence ask for less of it.
+    monkeypatch.setattr(GrblStage, "reply_s", 30.0)
+    monkeypatch.setattr("drivers.zaber.stage._REPLY_S", 30.0)
     (tmp_path / "grbl").mkdir()
     board = GrblController(tmp_path / "grbl")
     yield board
@@ -125,7 +129,10 @@ def test_a_part_that_fails_stops_the_others(stage: CompositeStage, chain: ZaberC
     assert stage.position()["x_um"] != pytest.approx(middle(stage)["x_um"], abs=1.0)
 
 
-def test_a_part_that_an_alarm_locks_is_unlocked_alone(board: GrblController, chain: ZaberChain) -> None:
+def test_a_part_that_an_alarm_locks_is_unlocked_alone(
+    board: GrblController, chain: ZaberChain, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(GrblStage, "reply_s", 1.0)  # what is reset or locked answers nothing
     board.settings |= {20: 0, 21: 1, 22: 0}  # no homing switches
     here = {"homing": "here", "axes": {"x_um": {"lower_limit": -9e3, "upper_limit": 9e3}}}
     parts = {
