@@ -13,7 +13,7 @@ from instrument.files import kept_times
 from instrument.plan import SOURCE, BenchAbilities, Part, Plan, SourceGrid, estimate
 from instrument.runs import rehearsal
 from instrument.runs.acquire import abilities_of, acquire
-from instrument.runs.pace import Pace, keep_pace, pace_of
+from instrument.runs.pace import Pace, _measured, keep_pace, pace_of
 from instrument.runs.rehearsal import rehearse, rehearsed
 from instrument.runs.run import Run
 from instrument.runs.runner import Runner, RunState, RunStatus
@@ -53,6 +53,23 @@ def test_the_pace_of_a_run_before(tmp_path: Path) -> None:
     assert unlike.run == other.path.name
     assert pace_of(plan_of("a", 9), abilities, tmp_path, toml + "# changed\n") is None
     assert "as in r: about 10.2 s." in Pace(1.0, "r").words(plan_of("a", 10), abilities)
+
+
+def test_three_frames_at_one_go_tell_a_pace_and_a_pause_or_a_second_start_none(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with open_bench(parse_config(TOML, None)) as bench:
+        abilities, toml = abilities_of(bench, tmp_path), bench.config.text
+        run = acquire(bench, plan_of("a", 3), tmp_path)
+    found = pace_of(plan_of("a", 9), abilities, tmp_path, toml)
+    assert found is not None
+    assert found.run == run.path.name
+    events = list(run.events)
+    for more in ("paused", "started"):
+        monkeypatch.setattr(run, "events", [*events, {"kind": more}])
+        assert _measured(run, abilities, toml) is None
+    monkeypatch.setattr(run, "events", events)
+    assert _measured(run, abilities, toml) == found
 
 
 def sweep_and_scene() -> Plan:
