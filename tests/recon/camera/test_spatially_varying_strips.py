@@ -116,6 +116,17 @@ def test_each_part_of_a_strip_costs_its_own_columns():
     assert columns == [both.axis.length * n for n in (3 * 12, 2 * 11, 3 * 12 + 2 * 11)]
 
 
+def test_a_strip_costs_the_same_wherever_it_lies():
+    own = part(slice(0, 15), (0,))
+    costs = {
+        SpatiallyVarying(
+            [strip(0, (slice(0, 15), slice(left, left + 21)), [own])], FIELD, SENSOR, n_channels=2
+        ).fft_pixels
+        for left in (5, 20, 30)
+    }
+    assert len(costs) == 1
+
+
 def test_tall_strips_are_added_once_whoever_adds_them():
     """More rows than a worker takes at once, of strips that begin below the first."""
     height = 3 * RUN + 5
