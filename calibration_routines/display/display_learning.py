@@ -98,7 +98,7 @@ class LearningProcedure(SeenAgain, Checked, Procedure):
         return Outlook(
             (
                 f"{self.patterns} random patterns of {height} x {width} pixels, {self.frames} frames",
-                kept_words(bench, self.frames, self.again),
+                kept_words(bench, self.frames, self.again, folder),
             ),
             beside_s=1e-3 * (self.frames * bench.camera.exposure_ms + self._shown * slm.settle_ms),
             work=(

@@ -24,6 +24,7 @@ import numpy.typing as npt
 from drivers.errors import StoppedError
 from drivers.frame import FrameMetadata
 from instrument.bench.bench import Bench
+from instrument.files.atomic import SPARE_BYTES, free_bytes
 from instrument.files.errors import BenchError, count, size
 from instrument.runs.acquire import record_of
 from instrument.runs.interrupts import interrupts_held
@@ -193,10 +194,20 @@ class KeptFrames:
         held.answer()
 
 
-def kept_words(bench: Bench, frames: int, again: Path | None) -> str:
-    """Return where frames go that are kept, and how large so many are at most."""
-    camera = bench.camera
+def kept_words(bench: Bench, frames: int, again: Path | None, folder: Path | None = None) -> str:
+    """Return where frames go that are kept, and how large so many are at most.
+
+    Raises BenchError where the disk of ``folder`` (None: the bench's data folder) has no room for them; of a
+    run that is seen ``again`` no more is known than that further ones need some.
+    """
+    camera, folder = bench.camera, again or folder or bench.config.data_folder
     each = math.prod(camera.frame_shape) * camera.frame_dtype.itemsize
+    need, free = 0 if again else frames * each, free_bytes(folder)
+    if need + SPARE_BYTES > free:
+        raise BenchError(
+            f"{folder}: {count(frames, 'frame')} need {size(need)} and {size(SPARE_BYTES)} to spare, but "
+            f"only {size(free)} are free on the disk. Free some, or choose another folder."
+        )
     words = f"frames are kept, {size(frames * each)} at most"
     return words if again is None else f"{words}; those of {again} are seen again"
 

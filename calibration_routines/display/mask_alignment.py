@@ -346,7 +346,7 @@ class AlignmentProcedure(Procedure):
                 f"±{self.settings.reach:g} of its pixels and ±{self.settings.depth_um:g} µm",
                 f"{most} frames at most, {self.settings.search_pictures(display)} of them to search; "
                 + (f"the stage moves {moves} times at most" if moves and bench.stage else "nothing moves"),
-                kept_words(bench, most, self.settings.again),
+                kept_words(bench, most, self.settings.again, folder),
             )
         )
 

@@ -71,7 +71,7 @@ class SlmProcedure(SeenAgain, Checked, Procedure):
             f"{self.levels} grey levels, {self.frames} frames at most; where the light flickers the levels "
             f"are taken up to {MOST_SERIES} times, {most} frames"
         )
-        return Outlook((words, kept_words(bench, most, self.again)))
+        return Outlook((words, kept_words(bench, most, self.again, folder)))
 
     def perform(self, bench: Bench, folder: Path | None, control: RunControl, listener: Listener) -> Outcome:
         """Measure, and save what ``align mask`` and ``show`` take."""

@@ -5,16 +5,17 @@ from __future__ import annotations
 import signal
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 from unittest.mock import Mock
 
 import numpy as np
 import pytest
 
-from calibration_routines.display import display_learning
+from calibration_routines.display import display_learning, kept_frames
 from calibration_routines.display.display_learning import LearningProcedure
 from calibration_routines.display.hologram_photograph import HologramCamera
-from calibration_routines.display.kept_frames import KeptFrames
+from calibration_routines.display.kept_frames import KeptFrames, kept_words
 from calibration_routines.display.mask_alignment import (
     AlignmentFailedError,
     AlignmentProcedure,
@@ -25,6 +26,7 @@ from calibration_routines.plan_procedures import ResumeProcedure
 from calibration_routines.procedure import Listener, Outcome
 from instrument.bench.bench import Bench
 from instrument.bench.config_file import parse_config
+from instrument.files.atomic import SPARE_BYTES
 from instrument.files.errors import BenchError
 from instrument.files.slm_image import load_slm_correction
 from instrument.runs.run import Run, RunCondition
@@ -178,3 +180,15 @@ def test_a_run_of_something_else_is_refused(tmp_path: Path) -> None:
         run = record(bench, tmp_path, n_frames=1)
     with pytest.raises(BenchError, match="no frames of such a routine"):
         measured(tmp_path, "no.json", again=run.path)
+
+
+def test_a_disk_without_room_is_said_before_anything_is_shown(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    camera = SimpleNamespace(frame_shape=(100, 100), frame_dtype=np.dtype(np.uint16))
+    bench: Any = SimpleNamespace(camera=camera, config=SimpleNamespace(data_folder=tmp_path))
+    monkeypatch.setattr(kept_frames, "free_bytes", lambda _: SPARE_BYTES + 200_000)
+    assert "200 kB at most" in kept_words(bench, 10, None, tmp_path)
+    with pytest.raises(BenchError, match="11 frames need 220 kB and 268 MB to spare, but only"):
+        kept_words(bench, 11, None)
+    assert kept_words(bench, 11, tmp_path)
