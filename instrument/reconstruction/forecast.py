@@ -58,8 +58,8 @@ class Forecast:
         At most so many: it may settle before.
     memory_bytes : float
         At the peak beyond what the program takes; NaN where the system does not say.
-    memory_less_bytes : float
-        How much less it may be: memory that is freed on the way, and given back to the system or not.
+    memory_apart_bytes : float
+        How much more or less it may be: memory that is freed on the way, and given back to the system or not.
     settles : int or None
         After how many iterations it ends, by the course of the first ones; None where they do not tell.
     counted : bool
@@ -76,7 +76,7 @@ class Forecast:
     """What there are several of."""
     where: str = ""
     """Whose memory it is, where not this program's."""
-    memory_less_bytes: float = 0.0
+    memory_apart_bytes: float = 0.0
 
     @property
     def seconds(self) -> float:
@@ -99,13 +99,14 @@ class Forecast:
     @property
     def between_bytes(self) -> tuple[float, float]:
         """Least and most memory that it is expected to take."""
-        return max(self.memory_bytes - self.memory_less_bytes, 0.0), self.memory_bytes
+        apart = self.memory_apart_bytes
+        return max(self.memory_bytes - apart, 0.0), self.memory_bytes + apart
 
     @property
     def _memory(self) -> str:
         least, most = map(in_words, self.between_bytes)
-        told_apart = self.memory_less_bytes > _WORTH_TELLING * self.memory_bytes
-        return f"{least} to {most}" if told_apart else most
+        told_apart = self.memory_apart_bytes > _WORTH_TELLING * self.memory_bytes
+        return f"{least} to {most}" if told_apart else in_words(self.memory_bytes)
 
     def __repr__(self) -> str:
         """Say it in a line, as Python shows what it is."""

@@ -42,7 +42,7 @@ SHOWN = 40
 GIVEN_BACK = 4 * 2**20
 """Bytes that solving frees and the C library gives back before the MP4 is written, or not.
 
-The same film goes one way or the other, the trial the dearer one (docs/benchmarks/time-told.md).
+The same film goes one way or the other, and so does its trial (docs/benchmarks/time-told.md).
 """
 
 
@@ -120,7 +120,7 @@ def forecast_video(
         counted=True,
         each="frame",
         where=f" in each of {count(workers, 'worker')}" if elsewhere else "",
-        memory_less_bytes=GIVEN_BACK if video.film and not elsewhere else 0.0,
+        memory_apart_bytes=GIVEN_BACK if video.film and not elsewhere else 0.0,
     )
 
 

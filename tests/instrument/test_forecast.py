@@ -205,8 +205,8 @@ def test_like_ones_have_the_same_options_and_psfs(scene: tuple[Measurement, Cali
 
 
 def test_memory_that_may_be_given_back_or_not_is_a_range_where_that_is_worth_telling() -> None:
-    told = Forecast(1.0, 0.1, 10, 23 * 2**20, 10, counted=True, memory_less_bytes=4 * 2**20)
-    assert told.between_bytes == (19 * 2**20, 23 * 2**20)
-    assert "19.0 MiB to 23.0 MiB of memory" in str(told)
+    told = Forecast(1.0, 0.1, 10, 23 * 2**20, 10, counted=True, memory_apart_bytes=4 * 2**20)
+    assert told.between_bytes == (19 * 2**20, 27 * 2**20)
+    assert "19.0 MiB to 27.0 MiB of memory" in str(told)
     assert "; 96.0 MiB of memory" in str(replace(told, memory_bytes=96 * 2**20))
     assert replace(told, memory_bytes=3 * 2**20).between_bytes[0] == 0
