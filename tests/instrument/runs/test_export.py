@@ -160,6 +160,14 @@ def test_png(run: Run, tmp_path: Path) -> None:
     assert np.array_equal(read[..., ::-1] if read.ndim == 3 else read, run.frame(4))
 
 
+def test_a_picture_that_is_there_is_not_replaced(run: Run, tmp_path: Path) -> None:
+    (tmp_path / "pictures").mkdir()
+    (tmp_path / "pictures" / "frame-4.png").write_text("mine")
+    with pytest.raises(FileError, match="exists already"):
+        export(run, tmp_path / "pictures", [4])
+    assert (tmp_path / "pictures" / "frame-4.png").read_text() == "mine"
+
+
 def test_mp4(run: Run, tmp_path: Path) -> None:
     export(run, tmp_path / "a.mp4")
     video = cv2.VideoCapture(str(tmp_path / "a.mp4"))
