@@ -23,7 +23,8 @@ from calibration_routines.display.hologram_photograph import (
 from instrument.display.alignment import Alignment
 from instrument.display.hologram_files import CHANNELS
 from instrument.files.errors import BenchError
-from instrument.files.images import Pixels, write_image
+from instrument.files.images import write_image
+from instrument.files.pictures import Pixels
 from recon.holography import Scores
 from recon.holography.scores import compare
 

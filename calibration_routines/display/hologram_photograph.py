@@ -21,7 +21,8 @@ from instrument.display.bench_display import bench_display
 from instrument.display.hologram import CaptureOptions, prepare_target, square, within
 from instrument.display.hologram_files import CHANNELS
 from instrument.files.errors import BenchError
-from instrument.files.images import Pixels, write_image
+from instrument.files.images import write_image
+from instrument.files.pictures import Pixels
 from instrument.files.slm_image import field_levels, is_of_mirrors, write_slm_image
 from recon.holography import Display, HologramModel, HologramOptions, Scores, Target, compute_hologram
 from recon.holography.camera_map import CameraMap

@@ -27,7 +27,8 @@ from instrument.display.hologram import (
 from instrument.display.hologram_files import CHANNELS, HologramFiles, light_words, score_words
 from instrument.display.hologram_forecast import forecast_hologram
 from instrument.files.errors import BenchError, FileError
-from instrument.files.images import Pixels, read_image, read_stack
+from instrument.files.images import read_image, read_stack
+from instrument.files.pictures import Pixels
 from instrument.reconstruction.forecast import Forecast
 from instrument.tasks.spots import HologramInputs, make_spots, say_distance, tell_limit
 from instrument.tasks.task import Given, saying_what_is_left

@@ -9,7 +9,7 @@ from itertools import pairwise
 from typing import Any
 
 from instrument.display.hologram import prepare_target
-from instrument.files.images import Pixels
+from instrument.files.pictures import Pixels
 from recon.holography import (
     Display,
     HologramOptions,

@@ -24,7 +24,7 @@ from instrument.display.limit import (
 )
 from instrument.display.spots import SpotFiles, middle_line, spots_of
 from instrument.files.errors import BenchError
-from instrument.files.images import Pixels
+from instrument.files.pictures import Pixels
 from instrument.tasks.task import BenchFile, Desk, Done, Only, bench_of, saying_what_is_left, task
 from recon.base.declare import option
 from recon.holography import (
