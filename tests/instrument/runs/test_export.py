@@ -146,6 +146,7 @@ def test_hdf5(run: Run, tmp_path: Path) -> None:
         told = file["frames"].attrs
         assert (told["significant_bits"], told["black_level"]) == (facts.significant_bits, facts.black_level)
         assert (told["pixel_format"], told["gain"]) == (facts.pixel_format, facts.gain)
+        assert told["axes"] == ("t,y,x", "t,y,x,c")[file["frames"].ndim - 3]
         times = [(run.metadata(i).host_time_ns - facts.host_time_ns) / 1e9 for i in STORED]
         assert list(file["time_s"]) == times
         for axis, place in facts.stage_position.items():
