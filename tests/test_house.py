@@ -190,6 +190,21 @@ def test_code_that_panels_copy_imports_names_from_where_they_are() -> None:
     assert count > 10
 
 
+def test_what_benchmarks_import_is_there() -> None:
+    """They are run by hand, some of them for hours: names that moved would be noticed then."""
+    files, lost, count = module_files(ROOT), [], 0
+    for path in (*(ROOT / "benchmarks").glob("*.py"), *(ROOT / "examples").rglob("*.py")):
+        for node in ast.walk(parsed(path)):
+            home = files.get(getattr(node, "module", None) or "")
+            if not isinstance(node, ast.ImportFrom) or home is None or home.name == "__init__.py":
+                continue
+            there = defined(home) | {name.rpartition(".")[2] for name in imported(parsed(home), types=True)}
+            lost += [f"{path.name}: {node.module}.{a.name}" for a in node.names if a.name not in there]
+            count += 1
+    assert lost == []
+    assert count > 300
+
+
 DECISIONS = ROOT / "docs" / "decisions"
 HOLD = re.compile(r"\* \[(\d{4})\]\((\S+)\) (?:~~)?(.*?)(?:~~)?(?: \((?:in part )?now (.*)\))?")
 """A line of the index: a decision, its heading, and what replaced it or parts of it."""
