@@ -25,7 +25,7 @@ from gui.session import BenchSession
 from gui.session_news import name_of
 from gui.way_on import WayOn
 from gui.widgets.building import after_rest, button, choice, fill, label, mark, split, text_view
-from gui.widgets.tab_order import tab_in_order
+from gui.widgets.tab_order import hand_on, tab_in_order
 from instrument.bench.config_file import TEMPLATES
 from instrument.bench.safety import LIGHT_DOUBT, MOTION_DOUBT, UNSAFE
 from instrument.files.errors import BenchError, SettingsError, count, size
@@ -287,11 +287,12 @@ class ProcedurePanel(Panel):
         self.accepted()
         self.use_button.hide()
         self.other_button.hide()
+        self.run_bar.set_running(True)
+        hand_on(self.run_bar.pause_button, (self.way_on.go_on_button,))
         self.way_on.offer(None)
         self._left.forget()
         self._said_at_end, self._doubted = "", frozenset()
         self._say(f"{title} has begun.", wrong=False)
-        self.run_bar.set_running(True)
         self.views.setEnabled(False)
         self.choice.setEnabled(False)
         self.began()

@@ -16,6 +16,7 @@ from gui.jobs import Job, JobCancelledError, JobContext
 from gui.panel import Panel
 from gui.widgets.building import button, every, fill, label
 from gui.widgets.entry import NumberEdit
+from gui.widgets.tab_order import hand_on
 from instrument.bench.lit import Lit
 from instrument.files.atomic import SPARE_BYTES, free_bytes, there_now
 from instrument.files.errors import FileError, count, duration, size
@@ -218,6 +219,8 @@ class RecordBar(QWidget):
             self.look_button.show()
 
     def _show_rest(self, offered: bool) -> None:
+        if not offered:
+            hand_on(self.button, (self.rest_button, self.leave_button))
         self.rest_button.setVisible(offered)
         self.leave_button.setVisible(offered)
 
@@ -225,7 +228,6 @@ class RecordBar(QWidget):
         """Offer the rest no longer, on no other day either."""
         rest, self.rest = self.rest, None
         self._show_rest(False)
-        self.button.setFocus()  # else the keyboard would be nowhere
         if rest is not None:
             self._session.keep(_LEFT, rest.run.name, True)
             self.note.setText(f"{rest.run.name}: {count(rest.stored, 'frame')} kept")

@@ -35,13 +35,18 @@ def tab_in_order(root: QWidget, *, after: QWidget | None = None) -> None:
 
 def take_turns(on: Sequence[QWidget], off: Sequence[QWidget]) -> None:
     """Enable some buttons and disable others; the keyboard goes with the work, not to wherever Qt goes on."""
-    had_it = any(part.hasFocus() for part in off)
     for part in on:
         part.setEnabled(True)
-    if had_it and on:
-        on[0].setFocus()
+    if on:
+        hand_on(on[0], off)
     for part in off:
         part.setEnabled(False)
+
+
+def hand_on(to: QWidget, leaving: Sequence[QWidget]) -> None:
+    """Give the keyboard to a part if one has it that is about to be put off or hidden."""
+    if any(part.hasFocus() for part in leaving):
+        to.setFocus()
 
 
 class Kept(QObject):
@@ -58,9 +63,10 @@ class Kept(QObject):
         """See the part that had the keyboard come back."""
         if event.type() == QEvent.Type.EnabledChange and isinstance(watched, QWidget) and watched.isEnabled():
             watched.removeEventFilter(self)
-            if self.part is watched and QApplication.focusWidget() is None:
-                watched.setFocus()
-            self.part = None
+            if self.part is watched:
+                self.part = None
+                if QApplication.focusWidget() is None:
+                    watched.setFocus()
         return False
 
 

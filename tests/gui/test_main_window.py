@@ -467,3 +467,19 @@ def test_what_is_typed_while_a_button_works_goes_into_no_field(qtbot: QtBot, win
     window.stop_button.setFocus()
     auto.setEnabled(True)
     assert window.stop_button.hasFocus(), "the operator went on meanwhile"
+
+
+def test_a_part_that_comes_on_first_takes_the_keyboard_from_no_other(
+    qtbot: QtBot, window: MainWindow
+) -> None:
+    window.activateWindow()
+    qtbot.waitUntil(window.isActiveWindow, timeout=WAIT_MS)
+    live = window.show_panel("live")
+    parts = [b for b in live.findChildren(QPushButton) if b.isVisible() and b.isEnabled()][:2]
+    for part in parts:
+        part.setFocus()
+        part.setEnabled(False)
+    assert QApplication.focusWidget() is None
+    for part in parts:
+        part.setEnabled(True)
+    assert parts[1].hasFocus(), "it had the keyboard last"

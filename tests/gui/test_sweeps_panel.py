@@ -233,7 +233,10 @@ def test_abort_keeps_what_was_taken(qtbot: QtBot, window: MainWindow, panel: Swe
     qtbot.waitUntil(lambda: window.status.words.text() != "Axial sweep …", timeout=WAIT_MS)
     assert window.status.words.text() == "Axial sweep: ended early"
     assert not panel.verdict.property("refused"), "what was asked for is no error"
+    window.activateWindow()
+    qtbot.waitUntil(window.isActiveWindow, timeout=WAIT_MS)
     press(qtbot, panel.way_on.go_on_button)
+    assert panel.run_bar.pause_button.hasFocus(), "it went on to a tab"
     assert panel.no_frame.isVisible(), "nothing of the run before"
     assert not panel.frame_words.text()
     with qtbot.waitSignal(panel.run.over, timeout=WAIT_MS):
