@@ -40,7 +40,10 @@ _SIGNS = (
     (re.compile(r"(?<=\d) um\b(?![/\\])"), " µm"),
     (re.compile(r"(?:\bin|,) um\b(?![/\\])"), lambda found: found[0].replace("um", "µm")),
     (re.compile(r"\+-(?=[ \d])"), "±"),
-    (re.compile(r"(?<=\d)%(?![\w%/\\])"), " %"),
+    (
+        re.compile(r"(?:\S*[/\\]|--[a-z][a-z-]*[ =])\S*|(?<=\d)%(?![\w%]|\.\w)"),
+        lambda found: " %" if found[0] == "%" else found[0],
+    ),
     (re.compile(rf"{_NO_PATH}led_array(?= opened|:| \({_NO_FOLDER})"), "LED array"),
     (re.compile(rf"{_NO_PATH}slm(?= \({_NO_FOLDER})"), "SLM"),
 )

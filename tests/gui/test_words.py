@@ -46,6 +46,8 @@ _IN_WINDOW = ("recon", "instrument", "calibration_routines")
         ),
         ("4.1 % larger (falls to 78%), 5%.", "4.1 % larger (falls to 78 %), 5 %."),
         ("/data/50%/x and 50%-off", "/data/50%/x and 50 %-off"),
+        ("/data/run 50%.tif, ./run50%: 5%", "/data/run 50%.tif, ./run50%: 5 %"),
+        (r"C:\a 1\run50%, --dark 5%, --dark=5%; 5%", r"C:\a 1\run50%, --dark 5%, --dark=5%; 5 %"),
         ("d 8.82 +- 0.14 mm, off by 1.7 um (--reach-um).", "d 8.82 ± 0.14 mm, off by 1.7 µm (--reach-um)."),
     ],
 )
