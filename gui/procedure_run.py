@@ -354,6 +354,7 @@ class RunBar(QWidget):
         self._when_paused = ", light off" if tips is _TIPS else ""
         self._small = small
         self.set_running(False)
+        self._show_start(running=False)
         self._give_place()
 
     def _abort(self) -> None:

@@ -89,6 +89,7 @@ def test_frames_and_time_that_are_bounds_are_shown_as_bounds(
 ) -> None:
     bar = RunBar(ProcedureRun(make_session()), "Start")
     qtbot.addWidget(bar)
+    assert "Ctrl+Enter" in bar.start_button.toolTip()
     bar.show_situation(Situation("aligning the mask", 20, 100, at_most=True, seconds_left=80))
     assert "20 of at most 100" in bar.words.text()
     assert "at most" in bar.words.text().split(", ")[-1]
