@@ -64,11 +64,15 @@ class Picture(QWidget):
         self.update()
 
     def show_larger(self) -> LargePicture | None:
-        """Show the picture as large as the screen allows, beside this window; None where there is none."""
+        """Show the picture as large as the screen allows, in one window beside this; None: there is none."""
         if not self._has_larger or self.pixmap.isNull():
             return None
-        window = LargePicture(self.pixmap, self)
+        there = (window for window in self.findChildren(LargePicture) if window.isVisible())
+        window = next(there, None) or LargePicture(self)
+        window.show_pixmap(self.pixmap)
         window.show()
+        window.raise_()
+        window.activateWindow()
         return window
 
     def mouseReleaseEvent(self, event: QMouseEvent) -> None:  # noqa: N802 - Qt's name
@@ -139,19 +143,23 @@ class LargePicture(QDialog):
     To be shown by ``show``: ``open`` and ``exec`` would keep clicks from STOP.
     """
 
-    def __init__(self, pixmap: QPixmap, parent: QWidget) -> None:
+    def __init__(self, parent: QWidget) -> None:
         super().__init__(parent)
         dress(self)
         self.setAttribute(Qt.WidgetAttribute.WA_DeleteOnClose)
         self.setWindowTitle("Picture")
         self.picture = Picture(larger=False)
-        self.picture.show_pixmap(pixmap)
-        close = QDialogButtonBox(QDialogButtonBox.StandardButton.Close)
+        self._close = close = QDialogButtonBox(QDialogButtonBox.StandardButton.Close)
         close.button(QDialogButtonBox.StandardButton.Close).setToolTip(
             "Close this window (Esc, which stops, too)"
         )
         close.rejected.connect(self.reject)
         fill(self, (self.picture, 1), close, margins=(8, 8, 8, 8))
-        room = parent.screen().availableSize() * _OF_THE_SCREEN
+
+    def show_pixmap(self, pixmap: QPixmap) -> None:
+        """Show a picture; the window takes its shape."""
+        self.picture.show_pixmap(pixmap)
+        room = self.screen().availableSize() * _OF_THE_SCREEN
         shown = pixmap.size().scaled(room, Qt.AspectRatioMode.KeepAspectRatio)
-        self.resize(shown.width() + 16, min(room.height(), shown.height() + close.sizeHint().height() + 24))
+        below = self._close.sizeHint().height() + 24
+        self.resize(shown.width() + 16, min(room.height(), shown.height() + below))
