@@ -135,7 +135,8 @@ def _levelled(found: Change, seen: Float, other: Float) -> Change:
         moved(image, *(by * way / 2 for way in ways))[inner] for image, by in ((seen, -1), (other, 1))
     )
     level, _ = _fitted(back, there)
-    return replace(found, brightness=level.brightness, ambient=level.ambient)
+    whole = float(there.mean(dtype=np.float64) / other.mean(dtype=np.float64))  # a rim may be dark
+    return replace(found, brightness=level.brightness, ambient=level.ambient * whole)
 
 
 def _rim(way: float, side: int) -> int:

@@ -116,3 +116,18 @@ def test_a_picture_that_only_moved_is_as_bright_as_it_was_and_no_other_light_cam
     assert (change.rows, change.columns) == pytest.approx(way, abs=0.04)
     assert change.brightness == pytest.approx(1, abs=0.005)
     assert change.ambient == pytest.approx(0, abs=0.005)
+
+
+@pytest.mark.parametrize("came", [0.0, 0.05])
+@pytest.mark.parametrize("way", [(0, 0), (0, -1), (3, 4), (12, 15), (-12, 15)])
+def test_other_light_is_a_part_of_the_whole_picture_however_far_its_pattern_moved(
+    way: tuple[int, int], came: float
+) -> None:
+    """Its rims are dark, and what was left between them was brighter: 5 % were read as 2.1 %."""
+    middle = PATTERN.copy()
+    middle[60:] = middle[:, 80:] = 0
+    seen = 1.1 * np.roll(middle, way, (0, 1)) + came * middle.mean()
+    change = compare(seen.astype(np.float32), middle.astype(np.float32))
+    assert (change.rows, change.columns) == pytest.approx(way, abs=0.02)
+    assert change.brightness == pytest.approx(1.1, abs=0.005)
+    assert change.ambient == pytest.approx(came, abs=0.003)
