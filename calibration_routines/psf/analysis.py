@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from copy import copy
 from dataclasses import dataclass, replace
 
 import cv2
@@ -84,7 +83,7 @@ class DarkModel:
     ) -> None:
         if len(exposures_ms) not in (1, 2) or len(frames) != len(exposures_ms):
             raise ValueError("Dark frames are needed at one or two exposures.")
-        self._exposures_ms = tuple(exposures_ms)
+        self._exposures_ms, self._full_scale = tuple(exposures_ms), full_scale
         self._means: list[Float] = [_mean(stack) for stack in frames]
         longest = int(np.argmax(self._exposures_ms))
         stack = frames[longest]
@@ -107,22 +106,20 @@ class DarkModel:
             more = float(np.median(_mean(stack[first:]) - _mean(stack[:first])))
             self.brightening_per_ms = more / self._exposures_ms[longest]
 
-    def with_lone(self, image: Float) -> DarkModel:
-        """Return it with the pixels of an image, (height, width) or (height, width, 3), that no light lit.
+    def lone(self, image: Float) -> npt.NDArray[np.bool_]:
+        """Return which pixels of an image of light, (height, width[, 3]), counts, stand alone.
 
-        A pixel that turns hot after the dark frames stands alone, however sharp the light is: brighter by
-        far than noise, and :data:`_LONE` times as bright as the median of the 3 x 3 pixels around it. A spot
-        as narrow as a pixel and a tenth is not.
+        Brighter by far than noise, than a hundredth of full scale, and :data:`_LONE` times as bright as the
+        median of the 3 x 3 pixels around. A pixel that turned hot does; a spot as narrow as a pixel and a
+        tenth does not, sharper light does: of one image alone nobody can tell. Noise is that of the image, a
+        median over its pixels, and no less than a count's own, as most pixels of a dim image have none.
         """
-        median = cv2.medianBlur(np.ascontiguousarray(image), 3)
+        median = np.maximum(cv2.medianBlur(np.ascontiguousarray(image), 3), 0.0)
         beyond = image - median
         noise = 1.4826 * float(np.median(np.abs(beyond - np.median(beyond))))
-        lone = (beyond > _FAR * noise) & (image > _LONE * np.maximum(median, 0.0)) & (beyond > 0)
-        if not lone.any():
-            return self
-        other = copy(self)
-        other.hot = self.hot | lone
-        return other
+        least = np.maximum(_FAR * np.maximum(noise, np.sqrt(median + 1.0)), 0.01 * self._full_scale)
+        found: npt.NDArray[np.bool_] = (beyond > least) & (image > _LONE * median)
+        return found
 
     def at(self, exposure_ms: float) -> Float:
         """Return the expected dark frame, float32 counts."""

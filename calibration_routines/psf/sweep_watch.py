@@ -23,8 +23,10 @@ from calibration_routines.psf.analysis import (
     channels_first,
     measure_point,
     plane_light,
+    replace_hot,
 )
 from calibration_routines.psf.psf_quality import (
+    MAX_CLIPPED,
     MAX_STEP_PX,
     PsfQuality,
     judge_next,
@@ -40,13 +42,14 @@ from calibration_routines.psf.stage_fit import (
 )
 from calibration_routines.psf.sweep_options import PointSweep
 from calibration_routines.psf.sweep_plan import DARK, REFERENCE
-from calibration_routines.scatter import NO_CHANGE, Change, Steadied, compare, reduction
+from calibration_routines.scatter import NO_CHANGE, TOLERATED, Change, Steadied, compare, reduction
 from instrument.bench.photograph import Snapshot
 from instrument.plan import Step
 from recon.base.blocks import block_mean
 from recon.types import Geometry
 
 Float = npt.NDArray[np.float32]
+Mask = npt.NDArray[np.bool_]
 
 _SATURATED_DIMMING = 0.7  # a PSF that saturated is taken again with this part of its exposure
 _SLACK = MAX_GAIN_ERROR + 1e-3 * MAX_ROTATION_MRAD  # of a shift: what a wrong d or a turned camera may do
@@ -117,6 +120,9 @@ class SweepWatch:
         self._anchor: tuple[Position, Float] | None = None  # the newest good pattern
         self._planes: list[PsfQuality] = []  # good central PSFs, one a depth
         self._first_visit: tuple[Position, Float] | None = None
+        self._first_light = np.empty((0, 0), np.float32)  # of all its pixels
+        self._alone: list[tuple[Position, Mask]] = []  # what stood alone at the newest places
+        self._late_hot: Mask | None = None
         self._visits: list[SourceVisit] = []
         self._change: Change = NO_CHANGE  # of the newest visit against the first
         self._points_done = 0
@@ -144,9 +150,9 @@ class SweepWatch:
         take = 1
         while True:
             plane = self._plane(point, taken)
-            steady, dark = self._light(plane)
-            image = _reduced(steady)
-            quality = self._judged(plane, steady, image, dark)
+            steady = self._light(plane)
+            image = _reduced(steady.mean)
+            quality = self._judged(plane, steady, image)
             again = quality.retake and self.take_again is not None and take <= self._sweep.retakes
             number, total = self._numbers[point], len(self._numbers)
             self._report(PointTaken(number, total, take, quality, plane.exposure_ms, again, image))
@@ -169,21 +175,41 @@ class SweepWatch:
             off_axis=point not in self._central,
         )
 
-    def _light(self, plane: PlaneFrames) -> tuple[Steadied, DarkModel]:
-        """Return a point's light without pixels that turned hot, of which later dark frames tell, and those.
+    def _light(self, plane: PlaneFrames) -> Steadied:
+        """Return a point's light without pixels that turned hot, of which later dark frames tell.
 
-        They stay where they are and would be taken for other light and for a pattern that is cut.
+        They stay where they are while light goes elsewhere, and would be taken for other light and for a
+        pattern that is cut: what stands alone here and in the newest picture of another place is such a one.
         """
         dark = self._dark_model(plane.full_scale)
         steady = plane_light(plane, dark)
-        now = dark.with_lone(steady.mean)
-        return (steady, dark) if now is dark else (plane_light(plane, now), now)
+        lone = dark.lone(steady.mean)
+        self._alone = [one for one in self._alone if one[0] != plane.source_um][-1:]
+        for _, before in self._alone:
+            both = lone & before
+            self._late_hot = both if self._late_hot is None else self._late_hot | both
+        self._alone.append((plane.source_um, lone))
+        if self._late_hot is None or not self._late_hot.any():
+            return steady
+        return replace(
+            steady, frames=np.stack([replace_hot(frame, self._late_hot) for frame in steady.frames])
+        )
 
-    def _judged(self, plane: PlaneFrames, steady: Steadied, image: Float, dark: DarkModel) -> PsfQuality:
+    def _judged(self, plane: PlaneFrames, steady: Steadied, image: Float) -> PsfQuality:
+        """Judge a point; what saturates counts unless it did without light, however lone it is.
+
+        Pixels that turned hot just now make a pattern look cut: without what stands alone it is not, and no
+        sharp light is needed to tell that.
+        """
         frame_shape = plane.frames.shape[1:3]
         factor = max(1, frame_shape[0] // image.shape[0])
         binning = max(1, self._sweep.binning)
+        dark = self._dark_model(plane.full_scale)
         found = measure_point(plane, image[np.newaxis], steady, dark, binning)
+        if found.clipped > MAX_CLIPPED and not plane.off_axis:
+            wide = _reduced(replace_hot(steady.mean, dark.lone(steady.mean)))
+            without = measure_point(plane, wide[np.newaxis], steady, dark, binning)
+            found = without if len(without.findings) < len(found.findings) else found
         found = replace(
             found,
             centroid_px=(found.centroid_px[0] * factor / binning, found.centroid_px[1] * factor / binning),
@@ -224,16 +250,19 @@ class SweepWatch:
     def _visit(self, taken: list[Snapshot]) -> None:
         assert self._reference is not None
         plane = self._plane(self._reference, taken)
-        steady, dark = self._light(plane)
-        image = _reduced(steady)
+        steady = self._light(plane)
         if self._first_visit is None:
-            seen = self._judged(plane, steady, image, dark)
+            image = _reduced(steady.mean)
+            seen = self._judged(plane, steady, image)
             self._planes += [] if seen.retake else [seen]
-            self._first_visit = self._reference, image
+            self._first_visit, self._first_light = (self._reference, image), steady.mean
             self._change, visit = NO_CHANGE, SourceVisit(1, self._points_done, 1.0, 0.0, ())
         else:
             before = self._visits[-1]
-            found = compare(image, self._first_visit[1])
+            first = self._first_light
+            hot = self._turned(steady.mean, first, plane.full_scale)
+            image, other = (_reduced(replace_hot(light, hot)) for light in (steady.mean, first))
+            found = compare(image, other)
             factor = max(1, taken[0].image.shape[0] // image.shape[0])
             change = replace(found, rows=factor * found.rows, columns=factor * found.columns)
             points = before.before_point, self._points_done
@@ -244,6 +273,19 @@ class SweepWatch:
             )
         self._visits.append(visit)
         self._report(visit)
+
+    def _turned(self, now: Float, first: Float, full_scale: int) -> Mask:
+        """Return the pixels that turned hot, or are no longer, since the first visit, at the same place.
+
+        Those that stand alone in one of two pictures of the same pattern. One that moved has left its own
+        sharp spots: where what is no longer alone was more than little of the light, they are left.
+        """
+        known = np.zeros(now.shape, bool) if self._late_hot is None else self._late_hot
+        dark = self._dark_model(full_scale)
+        alone, was = dark.lone(now), dark.lone(first)
+        if float(first[was & ~alone].sum()) > TOLERATED * float(first.sum()):
+            return known
+        return known | (alone ^ was)
 
     def _report(self, event: SweepEvent) -> None:
         if self.on_event is not None:
@@ -262,9 +304,9 @@ def retake_dimming(quality: PsfQuality) -> float:
     return _SATURATED_DIMMING if quality.saturated_pixels else 1.0
 
 
-def _reduced(steady: Steadied) -> Float:
+def _reduced(light: Float) -> Float:
     """Return a point's light, (height, width), binned as for registration."""
-    grey: Float = channels_first(steady.mean).mean(axis=0)
+    grey: Float = channels_first(light).mean(axis=0)
     return block_mean(grey, reduction(grey))
 
 
