@@ -157,10 +157,9 @@ class ReconstructForm(QWidget):
 
     def work(self) -> ReconstructionWork:
         """Return all that the form asks for: what, whereto, kept where; errors as :meth:`request`."""
-        output, request = self.options.make(OutputOptions), self.request()
-        if output.checkpoint is not None:
-            require_kept(request)
-        return ReconstructionWork(request, self.outputs(), output.checkpoint, int(output.rotate_deg))
+        output, request, outputs = self.options.make(OutputOptions), self.request(), self.outputs()
+        require_kept(output.checkpoint, request, outputs.files())
+        return ReconstructionWork(request, outputs, output.checkpoint, int(output.rotate_deg))
 
     def outputs(self) -> Outputs:
         """Return where the result goes.

@@ -65,9 +65,9 @@ def refuse_input(path: Path) -> None:
     for held in _inputs.get() or ():
         if is_same(path, held):
             found = "is an input itself"
-        elif path.is_dir() and _is_within(held, path):
+        elif path.is_dir() and is_within(held, path):
             found = f"holds the input {held}"
-        elif path.exists() and _is_content(held) and _is_within(path, held):
+        elif path.exists() and _is_content(held) and is_within(path, held):
             found = f"is part of the input {held}"
         else:
             continue
@@ -76,7 +76,7 @@ def refuse_input(path: Path) -> None:
         )
 
 
-def _is_within(path: Path, folder: Path) -> bool:
+def is_within(path: Path, folder: Path) -> bool:
     """Whether a path is in a folder or below, as the disk knows it: by another case or mount, too."""
     return any(is_same(place, folder) for place in path.resolve().parents)
 

@@ -6,8 +6,8 @@ history. Each is written whole or not at all; a kill costs what came after the l
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
-import shutil
 import time
 import zipfile
 from collections.abc import Mapping, Sequence
@@ -19,7 +19,14 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from instrument.files.atomic import check_writable, refuse_input, whole_file, write_json
+from instrument.files.atomic import (
+    check_writable,
+    clear_left,
+    is_within,
+    refuse_input,
+    whole_file,
+    write_json,
+)
 from instrument.files.errors import BenchError, FileError
 from instrument.files.reading import parse_json, read_bytes
 from instrument.files.record import plain
@@ -34,11 +41,26 @@ from recon.solvers.base import IterationRecord, Solver, StopReason
 _FINISHED = (StopReason.CONVERGED, StopReason.NOISE_LEVEL)
 
 
-def require_kept(request: PictureRequest | VolumeRequest | PatternedRequest) -> None:
-    """Refuse to keep what has no iterations.
+def require_kept(
+    folder: Path | None,
+    request: PictureRequest | VolumeRequest | PatternedRequest,
+    outputs: Sequence[Path] = (),
+) -> None:
+    """Refuse to keep what has no iterations, a folder of something else, and ``outputs`` in it.
 
-    Raises BenchError.
+    Raises BenchError; FileError.
     """
+    if folder is None:
+        return
+    if folder.is_dir():
+        _refuse_others(folder)
+    for output in outputs:
+        if is_within(output, folder):
+            raise FileError(
+                output,
+                f"lies in the checkpoint {folder}, which is removed in the end.",
+                "Name another folder.",
+            )
     solver = request.options.solver
     if solver != "auto" and SOLVERS.named(solver).one_step:
         raise BenchError(f"{solver} is one shot: --checkpoint does not apply to it.")
@@ -59,7 +81,7 @@ def checkpoint_for(
     """
     if folder is None:
         return None
-    require_kept(request)
+    require_kept(folder, request)
     problem = {
         "program": f"diffuserbench {version('diffuserbench')}",
         "format": FORMAT,
@@ -98,8 +120,9 @@ def settle_checkpoint(
             "choice of auto, and was not gone on with"
         )
     if all(reason in _FINISHED for reason in reasons):
-        keeper.remove()
-        told["Checkpoint"] = "removed: the work has come to its end"
+        others = keeper.remove()
+        stays = f"; {keeper.folder} stays, for what else it holds: {', '.join(others)}" if others else ""
+        told["Checkpoint"] = f"removed: the work has come to its end{stays}"
     else:
         told["Checkpoint"] = f"{keeper.folder}: the same again, with more time, goes on from it"
     return told
@@ -108,7 +131,7 @@ def settle_checkpoint(
 PROBLEM = "problem.json"
 FORMAT = 2
 """Of solvers' states: another one's are refused, as those kept before there was a number."""
-_STATE = "state/"
+_HISTORY, _STATE = "history", "state/"
 EVERY_S = 60.0
 """Seconds between two writings: the most that a kill costs, and rare enough to cost little itself."""
 
@@ -121,7 +144,7 @@ class CheckpointFolder:
     Parameters
     ----------
     folder : Path
-        Made when missing.
+        Made when missing; an empty one is taken.
     problem : mapping
         What decides the result, JSON-compatible: a folder kept for something else is refused.
     every_s : float
@@ -145,14 +168,15 @@ class CheckpointFolder:
             raise FileError(
                 folder, "is a file; a checkpoint is a folder.", "Name another, or one to be made."
             )
-        if (folder / PROBLEM).is_file():
-            refuse_input(folder)  # in the end all of it is removed
-            self._compare(problem)
-        elif folder.is_dir() and any(folder.iterdir()):
-            raise FileError(folder, "holds something else and was left as it is.", "Name another folder.")
+        if folder.is_dir():
+            _refuse_others(folder)
+            refuse_input(folder)
         else:
             check_writable(folder)
-            folder.mkdir(exist_ok=True)
+            folder.mkdir()
+        if (folder / PROBLEM).is_file():
+            self._compare(problem)
+        else:
             write_json(folder / PROBLEM, problem)
 
     @property
@@ -169,7 +193,7 @@ class CheckpointFolder:
             return ()
         try:
             with np.load(path, allow_pickle=False) as kept:
-                records = tuple(_record(row) for row in kept["history"])
+                records = tuple(_record(row) for row in kept[_HISTORY])
                 solver.restore(_state(kept))
         except KeyError as error:
             raise FileError(
@@ -190,14 +214,27 @@ class CheckpointFolder:
             return
         if not history:
             return
-        state = {f"{_STATE}{name}": value for name, value in _flat(solver.checkpoint(copy=False)).items()}
+        state: dict[str, Any] = {
+            f"{_STATE}{name}": value for name, value in _flat(solver.checkpoint(copy=False)).items()
+        }
+        state[_HISTORY] = np.array([astuple(record) for record in history])
         with whole_file(self._path(part)) as temporary:
-            np.savez(temporary, history=np.array([astuple(r) for r in history]), **state)
+            np.savez(temporary, **state)
         self._written, self._kept = time.monotonic(), True
 
-    def remove(self) -> None:
-        """Delete the folder: there is nothing left to go on with."""
-        shutil.rmtree(self.folder)
+    def remove(self) -> tuple[str, ...]:
+        """Delete what was kept, as there is nothing left to go on with; return what else the folder holds.
+
+        The folder goes where it holds nothing else.
+        """
+        clear_left(self.folder, again=True)
+        for path in (*filter(_is_state, self.folder.glob("*.npz")), self.folder / PROBLEM):
+            path.unlink(missing_ok=True)
+        if others := tuple(sorted(path.name for path in self.folder.iterdir())):
+            return others
+        with contextlib.suppress(OSError):  # a link to it, or a folder that is not ours to take away
+            self.folder.rmdir()
+        return ()
 
     def _path(self, part: str) -> Path:
         return self.folder / f"{part or 'picture'}.npz"
@@ -222,6 +259,23 @@ class CheckpointFolder:
                     f"here it is {problem.get(name)!r}.",
                     "Name another folder, or delete this one to start over.",
                 )
+
+
+def _refuse_others(folder: Path) -> None:
+    """Refuse a folder that holds something and no checkpoint."""
+    clear_left(folder)
+    if not (folder / PROBLEM).is_file() and any(folder.iterdir()):
+        raise FileError(folder, "holds something else and was left as it is.", "Name another folder.")
+
+
+def _is_state(path: Path) -> bool:
+    """Whether a file is what :meth:`CheckpointFolder.keep` writes."""
+    try:
+        with zipfile.ZipFile(path) as archive:
+            names = archive.namelist()
+    except (OSError, zipfile.BadZipFile):
+        return False
+    return f"{_HISTORY}.npy" in names and any(name.startswith(_STATE) for name in names)
 
 
 def digest(array: npt.NDArray[Any] | None) -> str | None:

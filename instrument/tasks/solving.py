@@ -10,7 +10,7 @@ from typing import Annotated
 
 from instrument.files.errors import BenchError
 from instrument.files.orientation import AS_IT_IS
-from instrument.reconstruction.checkpointing import checkpoint_for, settle_checkpoint
+from instrument.reconstruction.checkpointing import checkpoint_for, require_kept, settle_checkpoint
 from instrument.reconstruction.forecast import Forecast
 from instrument.reconstruction.foretold import Foretold, Like
 from instrument.reconstruction.job import Job
@@ -52,6 +52,7 @@ def reconstruct_photograph(
         else:
             desk.fact("Model", f"{request.options.model}, as asked for: nothing is chosen")
         return _told(desk, partial(request.forecast, job))
+    require_kept(output.checkpoint, request, outputs.files())
     outputs.check(0, overwrite=output.force)
     is_volume = isinstance(request, VolumeRequest)
     with saying_what_is_left(*outputs.files()):
@@ -140,6 +141,7 @@ def reconstruct_patterns(
     """Reconstruct the patterns, then the picture; tell, write. ``explain``: only say what it takes."""
     if output.explain:
         return _explain_patterns(desk, request)
+    require_kept(output.checkpoint, request, outputs.files())
     outputs.check(0, overwrite=output.force)
     with saying_what_is_left(*outputs.files()):
         with desk.step("patterns") as advance:

@@ -215,3 +215,33 @@ def test_a_checkpoint_outlives_a_result_that_cannot_be_written(files, run, monke
     code, said = run(*what)
     assert code == 0, said
     assert "removed: the work has come to its end" in said
+
+
+def test_results_do_not_go_into_the_folder_that_is_removed(files, run):
+    kept = files / "kept"
+    what = ("--psf", files / "psf.tif", "--tolerance", 0.5, "--checkpoint", kept)
+    kept.mkdir()
+    for outputs in (("-o", kept / "r.tif"), ("-o", files / "a.tif", "--figure", kept / "f.pdf")):
+        code, said = run(*what, *outputs)
+        assert code == 2
+        assert f"lies in the checkpoint {kept}, which is removed in the end." in said
+    assert not list(kept.iterdir())
+
+
+def test_only_what_was_kept_is_removed(files, run):
+    """An empty folder is taken; what others put into it since stays, and it with that."""
+    kept = files / "kept"
+    kept.mkdir()
+    what = ("--psf", files / "psf.tif", "--checkpoint", kept, "-o", files / "a.tif")
+    code, said = run(*what, "-n", 2)
+    assert code == 0, said
+    np.savez(kept / "mine.npz", psf=np.zeros(3))
+    (kept / "notes.txt").write_text("mine")
+    (kept / ".picture.01234567.part.npz").write_bytes(b"of a killed program")
+    code, said = run(*what, "--tolerance", 0.5)
+    assert code == 0, said
+    assert (
+        f"removed: the work has come to its end; {kept} stays, for what else it holds: mine.npz, notes"
+        in said
+    )
+    assert sorted(path.name for path in kept.iterdir()) == ["mine.npz", "notes.txt"]
