@@ -57,23 +57,38 @@ def protect(*inputs: Path) -> None:
 def refuse_input(path: Path) -> None:
     """Refuse to write over an input of the work at hand, whatever name or link leads to it.
 
-    Inputs are what :func:`protecting` holds: files, and folders with the files in them. A run or a
-    calibration, which get results beside what they hold, are held as a whole only.
+    Inputs are what :func:`protecting` holds: files, and folders with the files in them and what links in them
+    lead to. A run or a calibration, which get results beside what they hold, are held as a whole only.
 
     Raises FileError.
     """
-    for held in _inputs.get() or ():
+    inputs = _inputs.get() or () if is_same(path, path) else ()  # what is not there is none
+    for held in (place for one in inputs for place in (one, *_linked(one))):
         if is_same(path, held):
             found = "is an input itself"
         elif path.is_dir() and is_within(held, path):
             found = f"holds the input {held}"
-        elif path.exists() and _is_content(held) and is_within(path, held):
+        elif _is_content(held) and is_within(path, held):
             found = f"is part of the input {held}"
         else:
             continue
         raise FileError(
             path, f"{found}; no output replaces an input, by --force neither.", "Choose another name."
         )
+
+
+def _linked(folder: Path) -> Iterator[Path]:
+    """Give what links in a folder that is read lead to, and links in the folders that these lead to."""
+    left, seen = [folder], set[str]()
+    while left:
+        place, found = os.path.realpath(left.pop()), list[os.DirEntry[str]]()
+        with contextlib.suppress(PermissionError):  # nor can it be read
+            if place not in seen and _is_content(Path(place)):
+                with os.scandir(place) as entries:  # 10^5 names take no Paths
+                    found += (entry for entry in entries if entry.is_symlink() or entry.is_dir())
+        seen.add(place)
+        left += (Path(entry) for entry in found)
+        yield from (Path(entry).resolve() for entry in found if entry.is_symlink() and Path(entry).exists())
 
 
 def is_within(path: Path, folder: Path) -> bool:

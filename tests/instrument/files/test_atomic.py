@@ -232,6 +232,25 @@ def test_inputs_are_inputs_while_the_work_lasts(tmp_path: Path) -> None:
     assert refused() == {}
 
 
+def test_what_a_folder_that_is_read_has_by_links_is_an_input(tmp_path: Path) -> None:
+    for folder in ("psfs", "raw", "more", "far"):
+        (tmp_path / folder).mkdir()
+    for name in ("raw/a.tif", "raw/other.tif", "far/b.tif"):
+        (tmp_path / name).write_text("measured")
+    links = ("psfs/a.tif", "raw/a.tif"), ("psfs/more", "more"), ("more/far", "far"), ("more/back", "psfs")
+    for link, target in links:
+        (tmp_path / link).symlink_to(tmp_path / target)
+    (tmp_path / "psfs" / "gone.tif").symlink_to(tmp_path / "gone.tif")
+    (tmp_path / "psfs" / "itself").symlink_to(tmp_path / "psfs" / "itself")
+    refused = ("raw/a.tif", "psfs/a.tif", "raw", "more", "far", "far/b.tif", "psfs/more/far/b.tif")
+    with atomic.protecting([tmp_path / "psfs"]):
+        for name in refused:
+            with pytest.raises(FileError, match="no output replaces an input"):
+                atomic.refuse_input(tmp_path / name)
+        for name in ("raw/other.tif", "raw/new.tif", "gone.tif"):
+            atomic.refuse_input(tmp_path / name)
+
+
 def test_a_doubted_result_has_a_doubtful_name_of_its_own(tmp_path: Path) -> None:
     path, doubtful = tmp_path / "a.png", tmp_path / "doubtful_a.png"
     assert atomic.named_by_worth(path, doubted=False) == path
