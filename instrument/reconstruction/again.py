@@ -119,6 +119,11 @@ def _doubt(alike: Mapping[str, Likeness]) -> str:
             f"the volume's record does not tell its {unknown} from others, as one of a version before "
             "2026-12: whether they have changed since was not checked."
         )
+    if as_near := of[Likeness.ALIKE]:
+        said.append(
+            f"its record does not tell whether its {as_near} are those of then to the last bit: changes by "
+            "less than a hundred-thousandth were not looked for."
+        )
     if near := of[Likeness.NEAR]:
         said.append(
             f"its {near} are not to the last bit those of then: rounded otherwise by another processor or "

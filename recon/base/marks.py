@@ -27,11 +27,12 @@ Marks = dict[str, list[float]]
 
 
 class Likeness(Enum):
-    """How much arrays are those whose marks were noted."""
+    """How much arrays are those whose marks were noted, the gravest first."""
 
-    UNKNOWN = "nothing tells"
     OTHER = "others"
-    NEAR = "as near as rounding, which a small change is not told from"
+    UNKNOWN = "nothing tells"
+    NEAR = "as near as rounding, which a small change is not told from, and not to the last bit"
+    ALIKE = "as near as rounding; nothing tells whether to the last bit"
     SAME = "to the last bit"
 
 
@@ -72,26 +73,31 @@ def likeness(then: object, now: list[Marks]) -> Likeness:
     if len(then) != len(now):
         return Likeness.OTHER
     found = [_likeness(one, other) for one, other in zip(then, now, strict=True)]
-    order = (Likeness.UNKNOWN, Likeness.OTHER, Likeness.NEAR, Likeness.SAME)
-    return min(found, key=order.index)
+    return min(found, key=[*Likeness].index)
 
 
 def _likeness(one: Mapping[str, Any], now: Marks) -> Likeness:
     """Return how much one array is that whose marks a record tells."""
-    if _GAPS not in one and now[_GAPS] != _NO_GAPS:
-        return Likeness.UNKNOWN
-    alike = True
-    for name, values in now.items():
-        if name == _BITS:
-            continue
-        try:
-            known = np.asarray(one.get(name, _NO_GAPS if name == _GAPS else None), np.float64)
-        except (TypeError, ValueError, OverflowError):
-            return Likeness.UNKNOWN
-        if known.ndim != 1 or not np.isfinite(known).all():
-            return Likeness.UNKNOWN
-        scale = max(abs(values[0]), 1e-300) if name == _NORM else 1.0
-        alike &= known.shape == np.shape(values) and bool((abs(known - values) <= _APART * scale).all())
-    if not alike:
+    found = [_are_as_then(one, name, values) for name, values in now.items() if name != _BITS]
+    if False in found:
         return Likeness.OTHER
-    return Likeness.SAME if one.get(_BITS) == now[_BITS] else Likeness.NEAR
+    if None in found:
+        return Likeness.UNKNOWN
+    bits = one.get(_BITS)
+    if not isinstance(bits, list) or not all(isinstance(number, float | int) for number in bits):
+        return Likeness.ALIKE
+    return Likeness.SAME if bits == now[_BITS] else Likeness.NEAR
+
+
+def _are_as_then(one: Mapping[str, Any], name: str, values: list[float]) -> bool | None:
+    """Return whether some of an array's marks are those of a record; None where it does not tell."""
+    if name == _GAPS and name not in one:
+        return True if values == _NO_GAPS else None
+    try:
+        known = np.asarray(one.get(name), np.float64)
+    except (TypeError, ValueError, OverflowError):
+        return None
+    if known.ndim != 1 or not np.isfinite(known).all():
+        return None
+    scale = max(abs(values[0]), 1e-300) if name == _NORM else 1.0
+    return known.shape == np.shape(values) and bool((abs(known - values) <= _APART * scale).all())

@@ -146,6 +146,11 @@ def test_what_a_volume_was_made_of_is_found_again_and_refused_where_it_has_chang
     words = said(0)
     assert "fitted to the photograph" in words
     assert "its PSFs, dark frame, background and mask are not to the last bit those of then" in words
+    for name in ("psfs_marks", "measurement_marks"):
+        del told[name][0]["crc32"]
+    beside.write_text(json.dumps(record))
+    assert "not to the last bit those" not in (words := said(0)), "which nobody knows"
+    assert "does not tell whether its PSFs, dark frame, background and mask are those of then" in words
     del record["inputs"]["prepared"]
     beside.write_text(json.dumps(record))
     assert "its photograph, PSFs, dark frame, background and mask from others" in said(0)

@@ -141,7 +141,7 @@ def test_numbers_that_are_no_sizes_are_not_known() -> None:
             parse_json(text)
 
 
-UNKNOWN, OTHER, NEAR, SAME = Likeness
+OTHER, UNKNOWN, NEAR, ALIKE, SAME = Likeness
 
 
 def test_marks_are_the_same_but_for_rounding_and_no_others() -> None:
@@ -192,5 +192,14 @@ def test_numbers_that_are_none_are_no_zeros_nor_others() -> None:
     assert likeness([told["whole"]], [marks_of(lacking)]) is OTHER
     assert likeness([told["lacking"]], [marks_of(elsewhere)]) is OTHER
     before = {name: told["whole"][name] for name in ("shape", "norm", "marks")}  # of before 2026-12
-    assert likeness([before], [marks_of(whole)]) is NEAR
+    assert likeness([before], [marks_of(whole)]) is ALIKE, "no checksum tells more"
+    assert likeness([{**before, "crc32": ["12"]}], [marks_of(whole)]) is ALIKE
     assert likeness([before], [marks_of(lacking)]) is UNKNOWN
+    assert likeness([before], [marks_of(2 * lacking)]) is OTHER, "known, though not which are none"
+    assert likeness([before], [marks_of(lacking[1:])]) is OTHER
+    for name in ("shape", "norm", "marks"):
+        assert likeness([{**before, name: None}], [marks_of(whole)]) is UNKNOWN
+        assert likeness([{**before, name: None}], [marks_of(-2 * whole[1:])]) is OTHER
+    of_two = [marks_of(lacking), marks_of(2 * whole)]
+    assert likeness([before, before], of_two) is OTHER
+    assert likeness([told["whole"], before], [marks_of(whole)] * 2) is ALIKE
