@@ -43,12 +43,12 @@ def watched(
     seen: list[SweepEvent] = []
     watch.on_event = seen.append
     black = np.zeros(lights[0].shape)
-    for at in dark:
-        black[at] = FULL
+    for pixel in dark:
+        black[pixel] = FULL
     for part in range(2):
         watch.see(Step(index=part, part=0, repeat=part, label=DARK), snapshot(black))
-    for part, (z, light) in enumerate(zip(depths, lights, strict=False), start=1):
-        label, at = (REFERENCE, sweep.reference_point) if visits else (PSF, (0.0, 0.0, z))
+    for part, (z_um, light) in enumerate(zip(depths, lights, strict=False), start=1):
+        label, at = (REFERENCE, sweep.reference_point) if visits else (PSF, (0.0, 0.0, z_um))
         watch.see(Step(index=part + 1, part=part, repeat=0, label=label, source_um=at), snapshot(light))
     return seen
 
