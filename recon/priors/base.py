@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from abc import ABC, abstractmethod
 from copy import copy
+from numbers import Real
 from typing import Any, Self
 
 import numpy as np
@@ -72,12 +73,14 @@ class Prior(ABC):
 
     def checked_value(self, x: Array) -> float:
         """Return ``value``; InputError where a prior of one's own gives no real number."""
-        value = self.value(x)
-        if getattr(value, "shape", ()) != () or value is None or isinstance(value, complex):
-            shape = getattr(value, "shape", ())
-            given = f"an array {shape}" if shape else type(value).__name__
-            raise self._refused(f"its value must return a real number, not {given}")
-        return value
+        value: Any = self.value(x)
+        shape, dtype = getattr(value, "shape", ()), getattr(value, "dtype", None)
+        if isinstance(value, Real) or (shape == () and getattr(dtype, "kind", None) in {*"buif"}):
+            return float(value)
+        given = type(value).__name__
+        if isinstance(value, np.ndarray):
+            given = f"an array {shape}" if shape else f"an array of {dtype}"
+        raise self._refused(f"its value must return a real number, not {given}")
 
     def _refused(self, problem: str) -> InputError:
         return InputError(f"The prior {type(self).__name__}: {problem}.")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable
+from fractions import Fraction
 
 import numpy as np
 import pytest
@@ -94,6 +95,7 @@ WITHIN: list[Callable[[], object]] = [
     lambda: volume(L1(0.1) + NonNegativity()),
     lambda: Box(1.0, 1.0),
     lambda: L1(0.0),
+    *(lambda value=value: of_own(Valued(value)) for value in (1, np.float32(1), np.array(1), Fraction(1, 2))),
     lambda: Differences((1, 4, 5), (1, 1, 1)),
     lambda: Differences((1, 3, 4, 5), np.ones((3, 3)), (True, False, True)),
 ]
@@ -107,6 +109,11 @@ REFUSED: list[tuple[Callable[[], object], type[Exception], str]] = [
     (lambda: of_own(Valued(np.ones((3, 4)))), InputError, "a real number, not an array (3, 4)"),
     (lambda: of_own(Valued(None)), InputError, "value must return a real number, not NoneType"),
     (lambda: of_own(Valued(1j)), InputError, "value must return a real number, not complex"),
+    (lambda: of_own(Valued(np.complex64(1j))), InputError, "a real number, not complex64"),
+    (lambda: of_own(Valued(np.array(1j))), InputError, "a real number, not an array of complex128"),
+    (lambda: of_own(Valued(np.array("3"))), InputError, "a real number, not an array of <U1"),
+    (lambda: of_own(Valued(np.ones(1))), InputError, "a real number, not an array (1,)"),
+    (lambda: of_own(Valued("3")), InputError, "value must return a real number, not str"),
     (lambda: Convolution(np.full((1, 5, 6), np.nan), (8, 9)), InputError, "The PSF holds 30 values"),
     (lambda: of_own(L1(0.1), Bare()), AttributeError, "Bare has no range_shape: its __init__ must call"),
     (lambda: L1(-0.1), ValueError, "must be a number, 0 or more, not -0.1"),
