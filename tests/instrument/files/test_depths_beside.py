@@ -117,6 +117,21 @@ def test_three_planes_with_their_depths_beside_them_are_no_colours(tmp_path: Pat
         read(f"{tmp_path / 'a.npz'}::psfs")
 
 
+def test_four_planes_of_numpys_are_images_and_transparency_comes_last(tmp_path: Path) -> None:
+    """Four depths are likelier than colours and transparency in front; behind it nothing else is likely."""
+    pixels = np.random.default_rng(0).integers(0, 999, (4, 12, 16)).astype(np.uint16)
+    np.save(tmp_path / "planes.npy", pixels)
+    np.save(tmp_path / "rgba.npy", np.moveaxis(pixels, 0, -1))
+    np.save(tmp_path / "rgb.npy", np.moveaxis(pixels[:3], 0, -1))
+    with pytest.raises(FileError, match="holds 4 images; a single one is expected"):
+        read_image(tmp_path / "planes.npy")
+    assert read(tmp_path / "planes.npy").pixels.shape == (4, 12, 16)
+    for name, notes in (("rgba.npy", ("alpha channel left out",)), ("rgb.npy", ())):
+        for found, shown in ((read_image(tmp_path / name), ...), (read_stack(tmp_path / name), 0)):
+            np.testing.assert_array_equal(found.pixels[shown], np.moveaxis(pixels[:3], 0, -1))
+            assert found.notes == notes
+
+
 @pytest.mark.parametrize("version", ["5", "7.3"])
 def test_matlabs_texts_and_cells_that_are_called_depths_are_not_passed_over(
     tmp_path: Path, version: str
