@@ -335,6 +335,35 @@ def test_verdicts_and_warnings_do_too_and_are_written_down_as_typed(
     assert db.open_result(tmp_path / "scene.tif").verdict == result.verdict.sentences
 
 
+@pytest.mark.parametrize(
+    ("typed", "said"),
+    [
+        ("db.reconstruct(SQUARE)", r"'psf': it is called reconstruct\(image, psf, "),
+        ("db.chart(SQUARE, SQUARE)", r"too many .*: it is called chart\(subject, budget_s=..., size="),
+        ("db.hologram()", r"'picture': it is called hologram\(picture, bench="),
+    ],
+)
+def test_a_wrong_call_says_how_it_is_called(typed: str, said: str) -> None:
+    with pytest.raises(TypeError, match=said):
+        eval(typed, _names())
+
+
+def test_what_is_no_name_is_refused_by_what_saves(scene: tuple[np.ndarray, np.ndarray]) -> None:
+    result = db.reconstruct(*plain(scene), iterations=2, judged=False)
+    with pytest.raises(InputError, match="out must be the name of a file, not 3"):
+        result.save(3)  # type: ignore[arg-type]
+    with pytest.raises(InputError, match="figure must be the name of a file, not 3"):
+        result.save("scene.tif", figure=3)  # type: ignore[arg-type]
+
+
+def test_an_operator_is_made_and_turned_round_as_one_tries_first() -> None:
+    psf = np.ones((1, 9, 7), np.float32)
+    camera = db.Convolution(psf)
+    assert camera.range_shape == (1, 9, 7)
+    with pytest.raises(AttributeError, match=r"has no T: its adjoint.* is A\.H\."):
+        camera.T  # noqa: B018 # type: ignore[attr-defined]
+
+
 def test_values_are_given_as_python_gives_them() -> None:
     assert in_python("larger pixels (--bin 2) or --model local") == (
         "larger pixels (`binning=2`) or `model='local'`"
@@ -521,6 +550,7 @@ WRONG = {
     "db.TotalVariation(SQUARE)": r"must be a number, 0 or more, not an array of shape \(9, 9\)",
     "db.Box('a', 1)": "The lower limit must be a number, not 'a'",
     "db.Convolution('psf.tif', (9, 9))": "psfs must be an array .* not str",
+    "db.Convolution(SQUARE)": r"psfs must be .*, not \(9, 9\). A grey one is psf\[None\]",
     "db.Convolution(SQUARE[None], 9)": r"sensor_shape must be \(height, width\), two whole numbers, not 9",
     "db.Erasures(SQUARE[0, :5], (1, 9, 9))": r"valid must be an array \(height, width\)",
     "db.Fista(SQUARE, SQUARE, db.L1(1))": "operator must be a LinearOperator",

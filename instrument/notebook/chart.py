@@ -48,7 +48,7 @@ class Chart(ChartData):
     @speaking
     def save(self, folder: Path | str) -> tuple[Path, ...]:
         """Write chart.png, .html, .csv and .json into a folder; errors as ``write_text``."""
-        folder = Path(folder)
+        folder = Path(require_argument("folder", folder, Path))
         folder.mkdir(parents=True, exist_ok=True)
         record = folder / "chart.json"
         write_json(record, self.to_json())

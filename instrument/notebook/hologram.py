@@ -87,6 +87,7 @@ class HologramShown(HologramResult):
 
         Raises FileError when a file exists or cannot be written.
         """
+        require_argument("out", out, Path)
         files = HologramFiles(Path(out), self.files.binning, self.files.options, self.files.displays)
         files.check(overwrite=overwrite)
         files.write(0, 0, self)

@@ -28,6 +28,7 @@ from instrument.reconstruction.result_file import (
     write_reconstruction,
     write_volume,
 )
+from recon.base.arguments import require_argument
 from recon.reconstruction.result import Reconstruction
 from recon.types import Calibration
 
@@ -133,6 +134,8 @@ class Result(Reconstruction):
 
         Raises FileError when a file exists or cannot be written, naming it; BenchError for another angle.
         """
+        require_argument("out", out, Path)
+        require_argument("figure", figure, Path | None)
         out, page = Path(out), None if figure is None else Path(figure)
         turns = _turns(rotate_deg)
         if turns and not self.is_picture and out.suffix.lower() != ".png":

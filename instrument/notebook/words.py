@@ -6,6 +6,7 @@ Everywhere else sentences name options as they are typed in a terminal; so they 
 from __future__ import annotations
 
 import functools
+import inspect
 import re
 from collections.abc import Callable
 from dataclasses import fields, replace
@@ -70,10 +71,15 @@ def _options() -> tuple[Option, ...]:
 
 
 def speaking(function: Callable[P, R]) -> Callable[P, R]:
-    """Return a function whose refusals name options as Python does."""
+    """Return a function whose refusals name options as Python does, and that says how it is called."""
+    called = inspect.signature(function)
 
     @functools.wraps(function)
     def speaks(*args: P.args, **kwargs: P.kwargs) -> R:
+        try:
+            called.bind(*args, **kwargs)
+        except TypeError as error:
+            raise TypeError(f"{error}: {_call_of(function.__name__, called)}.") from None
         try:
             return function(*args, **kwargs)
         except (BenchError, InputError) as error:
@@ -81,6 +87,14 @@ def speaking(function: Callable[P, R]) -> Callable[P, R]:
             raise
 
     return speaks
+
+
+def _call_of(name: str, called: inspect.Signature) -> str:
+    """Return how a function is called: what it must be given, and the names of what it may."""
+    given = [p for p in called.parameters.values() if p.name != "self"]
+    must = [p.name for p in given if p.default is p.empty and p.kind is p.POSITIONAL_OR_KEYWORD]
+    may = [f"{p.name}=..." for p in given if p.default is not p.empty]
+    return f"it is called {name}({', '.join((*must, *may))})"
 
 
 class VerdictInPython(Verdict):

@@ -40,12 +40,14 @@ class LinearOperator(ABC):
     if not TYPE_CHECKING:
 
         def __getattr__(self, name: str) -> Any:
-            """Say what an operator of one's own lacks whose ``__init__`` did not call this one's."""
+            """Say that there is no T, and what one lacks whose ``__init__`` did not call this one's."""
             if name in ("domain_shape", "range_shape", "dtype"):
                 raise AttributeError(
                     f"The operator {type(self).__name__} has no {name}: its __init__ must call "
                     "super().__init__(domain_shape, range_shape, dtype)."
                 )
+            if name == "T":
+                raise AttributeError("An operator has no T: its adjoint, a real one's transpose, is A.H.")
             raise AttributeError(f"{type(self).__name__!r} object has no attribute {name!r}")
 
     @abstractmethod

@@ -71,8 +71,8 @@ class Convolution(LinearOperator):
     psfs : ndarray, (n_z, n_channels or 1, psf_height, psf_width) or (n_channels or 1, psf_height, psf_width)
         One PSF a depth and channel, or one for all channels; without depths the camera of a picture, whose
         object has none either. The PSF need not have the sensor's size.
-    sensor_shape : (int, int)
-        ``(height, width)`` of the data.
+    sensor_shape : (int, int), optional
+        ``(height, width)`` of the data; default the PSFs' own.
     n_channels : int, optional
         Number of channels of object and data when one PSF serves all; default as many as ``psfs`` has.
     grid_shape : (int, int), optional
@@ -103,7 +103,7 @@ class Convolution(LinearOperator):
     def __init__(
         self,
         psfs: Array,
-        sensor_shape: tuple[int, int],
+        sensor_shape: tuple[int, int] | None = None,
         *,
         n_channels: int | None = None,
         grid_shape: tuple[int, int] | None = None,
@@ -114,7 +114,8 @@ class Convolution(LinearOperator):
             expected = "an array ([n_z, ]n_channels, height, width) of real numbers"
             psfs = require_numbers("psfs", psfs, expected)
         if psfs.ndim not in (3, 4):
-            raise InputError(f"psfs must be ([n_z, ]n_channels, height, width), not {psfs.shape}.")
+            grey = " A grey one is psf[None]." if psfs.ndim == 2 else ""
+            raise InputError(f"psfs must be ([n_z, ]n_channels, height, width), not {psfs.shape}.{grey}")
         if len(psfs) == 0:
             raise InputError("The list of depths is empty: a volume needs at least one PSF.")
         if not np.isfinite(float(psfs.sum(dtype=np.float64))):
@@ -127,7 +128,8 @@ class Convolution(LinearOperator):
             raise InputError(
                 f"PSFs of {own_channels} channels do not serve {n_channels}: give 1 or {n_channels}."
             )
-        self.sensor_shape = require_shape("sensor_shape", sensor_shape)
+        given = psf_shape if sensor_shape is None else sensor_shape
+        self.sensor_shape = require_shape("sensor_shape", given)
         self.field_shape, self.centre = field_of(self.sensor_shape, tuple(psf_shape))
         height, width = fft.fast_shape(self.field_shape) if grid_shape is None else grid_shape
         self.grid_shape = (height, width)
