@@ -61,6 +61,8 @@ def require_kept(
                 f"lies in the checkpoint {folder}, which is removed in the end.",
                 "Name another folder.",
             )
+        if is_within(folder, output):
+            raise FileError(folder, f"lies in {output}, which is replaced by the result.", "Name another.")
     solver = request.options.solver
     if solver != "auto" and SOLVERS.named(solver).one_step:
         raise BenchError(f"{solver} is one shot: --checkpoint does not apply to it.")
@@ -227,6 +229,8 @@ class CheckpointFolder:
 
         The folder goes where it holds nothing else.
         """
+        if not self.folder.is_dir():  # somebody did it
+            return ()
         clear_left(self.folder, again=True)
         for path in (*filter(_is_state, self.folder.glob("*.npz")), self.folder / PROBLEM):
             path.unlink(missing_ok=True)

@@ -226,6 +226,19 @@ def test_results_do_not_go_into_the_folder_that_is_removed(files, run):
         assert code == 2
         assert f"lies in the checkpoint {kept}, which is removed in the end." in said
     assert not list(kept.iterdir())
+    (inside := files / "v.ome.zarr" / "kept").mkdir(parents=True)
+    code, said = run(
+        "--volume", files / "psfs.tif", "--prior", "l1", "--checkpoint", inside, "-o", inside.parent
+    )
+    assert code == 2
+    assert f"lies in {inside.parent}, which is replaced" in said
+
+
+def test_a_checkpoint_that_somebody_has_deleted_is_removed(tmp_path):
+    keeper = CheckpointFolder(tmp_path / "kept", {})
+    (tmp_path / "kept" / "problem.json").unlink()
+    (tmp_path / "kept").rmdir()
+    assert keeper.remove() == ()
 
 
 def test_only_what_was_kept_is_removed(files, run):
