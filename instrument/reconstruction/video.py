@@ -177,8 +177,11 @@ def solve_video(
     prepared: PreparedVideo,
     on_progress: Callable[[BlockReport], object],
     cancel: threading.Event,
+    on_lost: Callable[[int], object] = lambda _: None,
 ) -> bool:
     """Solve what is left, as the options say: in this process, on processes here, or on a cluster.
+
+    ``on_lost`` is told how many workers were lost, each time.
 
     Raises BenchError when there is no Dask or no scheduler, or one of somebody else; FileError or OSError
     when a frame cannot be read or a picture written.
@@ -196,7 +199,7 @@ def solve_video(
         else:
             crew = cluster(workers=video.workers, scheduler=video.scheduler, owner=video.scheduler_owner)
             with crew as client:
-                on_cluster(client, folder, output, prepared.left, on_progress, cancel)
+                on_cluster(client, folder, output, prepared.left, on_progress, cancel, on_lost)
     except CancelledError:
         return False
     return True

@@ -18,7 +18,7 @@ from tempfile import TemporaryDirectory
 
 import numpy as np
 
-from instrument.files.errors import count
+from instrument.files.errors import BenchError, count
 from instrument.files.ome_zarr import stem_of
 from instrument.reconstruction.forecast import TRIED, Forecast
 from instrument.reconstruction.video import (
@@ -39,6 +39,8 @@ FRAMES = 4
 """Of each block that is tried: one that begins cold, and three that go on."""
 SHOWN = 40
 """Pictures of an MP4 that tell what one takes: VP9 keeps 25 before it writes."""
+ATTEMPTS = 2
+"""That a trial has in which workers are lost."""
 GIVEN_BACK = 4 * 2**20
 """Bytes that solving frees and the C library gives back before the MP4 is written, or not.
 
@@ -89,7 +91,7 @@ def forecast_video(
     """Carry out the first frames of some blocks, and say what all that is left takes; None when cancelled.
 
     ``on_progress`` is told the share that is over. Errors as of
-    :func:`~instrument.reconstruction.video.solve_video`.
+    :func:`~instrument.reconstruction.video.solve_video`; BenchError where workers are lost again and again.
     """
     prepared, cancel = trial.prepared, cancel or threading.Event()
     job, video = prepared.job, prepared.request.video
@@ -100,8 +102,8 @@ def forecast_video(
     asked = replace(plan, frames=tried)
     if together:
         asked = replace(asked, cold_iterations=min(plan.cold_iterations, TRIED))
-    run = _solved(trial, asked, cancel, on_progress)
-    if cancel.is_set():
+    run = _undisturbed(trial, asked, cancel, on_progress)
+    if run is None:
         return None
     times = plan.cold_iterations / asked.cold_iterations
     pace = _together(run.reports, times) if together else _one_by_one(run.reports)
@@ -138,6 +140,8 @@ class _Solved:
 
     reports: list[BlockReport]
     seconds: float
+    lost: int = 0
+    """Workers whose blocks were begun anew: it took longer than it does."""
 
     @property
     def beside_s(self) -> float:
@@ -148,11 +152,27 @@ class _Solved:
         return max(self.seconds - max(busy.values(), default=0.0), 0.0)
 
 
+def _undisturbed(
+    trial: PreparedTrial, plan: VideoPlan, cancel: threading.Event, on_progress: Callable[[float], object]
+) -> _Solved | None:
+    """Solve a shorter plan until no worker is lost in it; None when cancelled. Raises BenchError."""
+    for _ in range(ATTEMPTS):
+        run = _solved(trial, plan, cancel, on_progress)
+        if cancel.is_set():
+            return None
+        if not run.lost:
+            return run
+    raise BenchError(
+        "Workers were lost each time that the first frames were tried: what the film takes cannot be told. "
+        "Take fewer workers, or try again when the machine is less busy."
+    )
+
+
 def _solved(
     trial: PreparedTrial, plan: VideoPlan, cancel: threading.Event, on_progress: Callable[[float], object]
 ) -> _Solved:
     """Solve the blocks of a shorter plan."""
-    job, reports = trial.prepared.job, list[BlockReport]()
+    job, reports, lost = trial.prepared.job, list[BlockReport](), list[int]()
     job.go_on_without(plan, sorted(job.done()))
     began_s = time.perf_counter()
 
@@ -160,8 +180,8 @@ def _solved(
         reports.append(report)
         on_progress(sum(one.solved for one in reports) / len(plan.frames))
 
-    solve_video(trial.prepared, note, cancel)
-    return _Solved(reports, time.perf_counter() - began_s)
+    solve_video(trial.prepared, note, cancel, lost.append)
+    return _Solved(reports, time.perf_counter() - began_s, sum(lost))
 
 
 def _finished(prepared: PreparedVideo, frames: Sequence[int], n_frames: int) -> tuple[float, float]:

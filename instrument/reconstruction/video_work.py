@@ -235,11 +235,18 @@ def at_once(blocks: int, video: VideoOptions, *, together: bool) -> int:
 
 
 def on_cluster(
-    client: Any, job: Path, output: Path, blocks: Sequence[int], on_progress: OnBlock, cancel: threading.Event
+    client: Any,
+    job: Path,
+    output: Path,
+    blocks: Sequence[int],
+    on_progress: OnBlock,
+    cancel: threading.Event,
+    on_lost: Callable[[int], object] = lambda _: None,
 ) -> None:
     """Solve blocks on a Dask cluster whose workers see the same files; raises as :func:`in_process`.
 
-    A block whose worker is lost is solved by another, and the loss is logged. Raises BenchError where every
+    A block whose worker is lost is solved by another; the loss is logged, and ``on_lost`` told how many were.
+    Raises BenchError where every
     worker that took a block was lost.
     """
     work = partial(solve_block, str(job), str(output), threads=1)
@@ -256,6 +263,7 @@ def on_cluster(
                     "happens again, memory may be short: take fewer.",
                     count(lost, "worker"),
                 )
+                on_lost(lost)
             crew = here
             finished = {future for future in left if future.done()}
             for future in finished:

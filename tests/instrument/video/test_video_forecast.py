@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 import threading
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
 from instrument.cli import main
-from instrument.files.errors import FileError
+from instrument.files.errors import BenchError, FileError
 from instrument.reconstruction import video_forecast as module
-from instrument.reconstruction.video import prepare_video, solve_video
+from instrument.reconstruction.video import PreparedVideo, prepare_video, solve_video
 from instrument.reconstruction.video_forecast import forecast_video, trial_of
 from instrument.reconstruction.video_job import VideoJob
 from instrument.reconstruction.video_work import BlockReport
@@ -94,6 +95,33 @@ def test_of_a_film_that_was_begun_what_is_left_is_told(recording: Path, tmp_path
     assert told is not None
     assert " a frame" not in str(told), "only the MP4 is left"
     assert VideoJob.folder_of(asked.out).exists()
+
+
+def test_a_trial_that_lost_a_worker_is_made_again_and_not_counted(
+    recording: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    losing = [1, 0, 1, 1]
+    begun: list[int] = []
+
+    def solve(prepared: PreparedVideo, note: Callable[[BlockReport], object], *hooks: object) -> bool:
+        *_, on_lost = hooks
+        lost = losing.pop(0)
+        begun.append(lost)
+        if lost:
+            on_lost(lost)  # type: ignore[operator]
+        return solve_video(prepared, note, threading.Event())
+
+    monkeypatch.setattr(module, "solve_video", solve)
+    with trial_of(request(recording, tmp_path)) as trial:
+        told = forecast_video(trial)
+        assert told is not None
+    assert begun == [1, 0]
+    with (
+        trial_of(request(recording, tmp_path)) as trial,
+        pytest.raises(BenchError, match="Workers were lost each time"),
+    ):
+        forecast_video(trial)
+    assert begun == [1, 0, 1, 1]
 
 
 def test_what_is_wrong_is_said_of_the_film_that_was_asked_for(recording: Path, tmp_path: Path) -> None:

@@ -166,9 +166,10 @@ def test_workers_that_are_lost_are_told(tmp_path: Path, caplog: pytest.LogCaptur
         def cancel(self, left: list[object]) -> None:
             self.cancelled = left
 
-    client = Client()
+    client, told = Client(), list[int]()
     with pytest.raises(BenchError, match="Every worker that took one of the blocks was lost"):
-        on_cluster(client, tmp_path, tmp_path, [0], lambda _: None, threading.Event())
+        on_cluster(client, tmp_path, tmp_path, [0], lambda _: None, threading.Event(), told.append)
+    assert told == [1, 1]
     assert len(client.cancelled or ()) == 1
     assert [record.getMessage().split(":")[0] for record in caplog.records] == [
         "1 worker ended or cannot be reached"
