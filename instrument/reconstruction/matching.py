@@ -9,7 +9,14 @@ import numpy as np
 
 from instrument.files.errors import FileError
 from instrument.files.images import ImageFile
-from instrument.reconstruction.preparation import Dark, DarkChoice, bin_image, dark_level
+from instrument.reconstruction.preparation import (
+    Dark,
+    DarkChoice,
+    bin_image,
+    dark_level,
+    darkest_corner,
+    in_counts,
+)
 from recon.types import Calibration
 
 MOST_TIMES = 8
@@ -141,11 +148,9 @@ def matched_dark(
     dark = dark_level(choice, psf, image)
     others = apart or psf.pixels.shape[:2] != image.pixels.shape[:2]
     if isinstance(dark.image, np.ndarray) and others:
-        own = dark_level("auto", psf, image)
-        words = (
-            f"{dark.reason} from the image, {float(np.mean(own.psf)):.4g} from the PSF (its darkest corner)"
-        )
-        dark = Dark(bin_image(dark.image, pair.image_binning), own.psf, words)
+        corner, name = darkest_corner(psf.pixels)
+        words = f"{dark.reason} from the image, {in_counts(corner)} from the PSF (its {name} corner)"
+        dark = Dark(bin_image(dark.image, pair.image_binning), corner, words)
     if isinstance(dark.psf, np.ndarray):
         of_psf = dark.psf if dark.psf.ndim <= pair.psf.pixels.ndim else dark.psf.mean(axis=-1)
         whole = of_psf.shape[:2] == psf.pixels.shape[:2]

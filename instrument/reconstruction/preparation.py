@@ -219,29 +219,31 @@ def dark_from_corners(psf: ImageFile, image: ImageFile) -> Dark:
     more than those, so that nothing is pushed below zero by an offset that the image does not have. Where the
     PSF stands on light that grows across it, that is subtracted from it instead.
     """
-    dark = _of_corners(psf, image)
-    plane = sloping_light(psf.pixels)
-    if plane is None:
-        return dark
-    words = (
-        f"{dark.reason}; from the PSF light that grows across it by {rise_of(plane):.3g} counts, as its "
-        "border shows: take it in the dark"
-    )
-    return replace(dark, psf=plane, reason=words)
-
-
-def _of_corners(psf: ImageFile, image: ImageFile) -> Dark:
-    corner, name = _darkest_corner(psf.pixels)
-    darkest = darkest_block(image.pixels)
-    if both_raw(psf, image):
-        if corner <= darkest:
-            reason = f"{corner:.1f} counts from both: mean of the PSF's {name} corner"
-            return Dark(corner, corner, f"{reason} (estimated; a frame or counts may be given by --dark)")
-        why = "the image's darkest 10 x 10 pixels, darker than the PSF's corners"
+    corner, name = darkest_corner(psf.pixels)
+    darkest, plane = darkest_block(image.pixels), sloping_light(psf.pixels)
+    raw = both_raw(psf, image)
+    rise = 0.0 if plane is None else rise_of(plane)
+    rise = round(rise) if rise >= 10 else rise  # of fractions they may be less than one
+    shared = raw and corner <= darkest
+    if shared and plane is None:
+        words = f"{corner:.1f} counts from both: mean of the PSF's {name} corner"
     else:
-        why = "the image's darkest 10 x 10 pixels"
-    reason = f"{darkest:.4g} from the image ({why}), {corner:.4g} from the PSF (its {name} corner)"
-    return Dark(darkest, corner, f"{reason} (estimated; a frame or counts may be given by --dark)")
+        why = f"mean of the PSF's {name} corner" if shared else "the image's darkest 10 x 10 pixels"
+        why += ", darker than the PSF's corners" if raw and not shared else ""
+        of_psf = (
+            f"{in_counts(corner)} from the PSF (its {name} corner)"
+            if plane is None
+            else f"from the PSF light that grows across it by {in_counts(rise)} counts, as its border "
+            "shows: take it in the dark"
+        )
+        words = f"{in_counts(corner if shared else darkest)} from the image ({why}), {of_psf}"
+    words += " (estimated; a frame or counts may be given by --dark)"
+    return Dark(corner if shared else darkest, corner if plane is None else plane, words)
+
+
+def in_counts(level: float) -> str:
+    """Return counts by at least four digits, large ones without an exponent."""
+    return f"{level:.0f}" if abs(level) >= 1000 else f"{level:.4g}"
 
 
 def both_raw(psf: ImageFile, image: ImageFile) -> bool:
@@ -255,7 +257,8 @@ def both_raw(psf: ImageFile, image: ImageFile) -> bool:
     return bool(fewest < counts.max() <= most and counts.min() >= 0 and not (counts % 1).any())
 
 
-def _darkest_corner(pixels: npt.NDArray[Any]) -> tuple[float, str]:
+def darkest_corner(pixels: npt.NDArray[Any]) -> tuple[float, str]:
+    """Return the mean of a PSF's darkest corner, and which it is."""
     height, width = pixels.shape[:2]
     margin = min(_MARGIN, height // 4, width // 4)
     side = max(1, min(_PATCH, height // 4, width // 4))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -21,7 +22,7 @@ from instrument.reconstruction.matching import (
     whole_binnings,
 )
 from instrument.reconstruction.options import InputOptions
-from instrument.reconstruction.preparation import Crop
+from instrument.reconstruction.preparation import Crop, darkest_corner
 from recon import reconstruct
 from recon.base.blocks import block_mean
 from recon.evaluation.measured_sets import data_folder, measured_set
@@ -80,6 +81,24 @@ def test_a_dark_frame_of_the_photograph_leaves_the_psf_its_own_level(pair: tuple
         np.testing.assert_allclose(made.measurement, photograph[::2, ::2] - 60.0)
         assert made.calibration.psfs.min() == 0
         assert "from the PSF" in made.notes["Dark"]
+
+
+@pytest.mark.parametrize("srgb", ["none", "psf"])
+def test_a_dark_frame_given_leaves_the_psf_light_that_grows_across_it(
+    pair: tuple[Pixels, Pixels], srgb: str
+) -> None:
+    psf, photograph = pair
+    psf = (psf + np.linspace(0, 8000, psf.shape[1])).astype(np.uint16)
+    theirs = photograph if srgb == "psf" else photograph[::2, ::2]
+    dark = ImageFile(Path("dark.tif"), np.full_like(theirs, 60))
+    noted = job(psf, theirs, dark=dark, srgb=srgb).notes["Dark"]
+    told = re.search(r"([\d.]+) from the PSF \(its upper left corner\)", noted)
+    assert told is not None
+    counts, name = darkest_corner(psf)  # straightened, it is darker
+    assert name == "upper left"
+    assert 0 < float(told[1]) <= round(counts, 1)
+    asked = job(psf, theirs, dark="auto").notes["Dark"]  # which a plane is for
+    assert "grows across" in asked
 
 
 def test_a_binned_pixel_is_erased_where_one_of_its_pixels_is_saturated(pair: tuple[Pixels, Pixels]) -> None:

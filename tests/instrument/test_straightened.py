@@ -107,7 +107,7 @@ def test_a_dark_frame_is_straightened_with_its_photograph_and_the_record_is_of_t
     assert (job.known_noise is None) is (which != "psf")
     assert job.provenance["image"] == source_record(image)
     assert "uint8" in job.notes["Image"]
-    assert ("darkest corner" in job.notes["Dark"]) is (which != "both")
+    assert ("from the PSF (its" in job.notes["Dark"]) is (which != "both")
     with pytest.raises(FileError, match="the dark frame has 16 bit"):
         job_from_files(psf, image, InputOptions(dark=file(np.ones(SHAPE, np.uint16)), srgb=which))
 
