@@ -31,6 +31,7 @@ from instrument.reconstruction.preparation import (
     reduce_valid,
     saturated_pixels,
 )
+from recon.base.sloping_light import sloping_light
 from recon.errors import InputError
 from recon.types import Calibration, Geometry
 
@@ -160,6 +161,19 @@ def test_light_that_grows_across_a_psf_is_taken_off_it(times: int, colours: int)
     assert grown is not None
     assert abs(int(grown[1]) - 516) <= 3
     assert "grows" not in no_word
+    assert told.count("from the PSF") == 1  # its corner's level is not taken off beside it
+    steep = prepared(40 + 20 * (slope - 40))[1]
+    assert re.search(r"light that grows across it by 10\d{3} counts", steep)
+
+
+@pytest.mark.parametrize(("before", "wide"), [(0, 100), (0, 80), (50, 150), (100, 200), (200, 300)])
+@pytest.mark.parametrize("is_round", [False, True])
+def test_a_broad_lobe_beside_the_middle_is_the_psfs_own(before: int, wide: int, is_round: bool) -> None:
+    y, x = np.mgrid[:120.0, :160.0]
+    far2 = (x + before) ** 2 + is_round * (y - 60) ** 2
+    psf = in_the_middle(caustics()) + 3000 * np.exp(-far2 / 2 / wide**2) + 34
+    psf += 3 * np.random.default_rng(0).standard_normal(psf.shape)
+    assert sloping_light(psf) is None
 
 
 @pytest.mark.parametrize("window", [np.s_[:, :], np.s_[30:, 40:], np.s_[:90, 20:140]])
