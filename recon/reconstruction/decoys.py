@@ -359,7 +359,8 @@ def _coded(
     """Return that something is coded for the eye, in words, and what to do; None where nothing is.
 
     A photograph of few bright points is explained better by anything once it is raised to a power. What was
-    coded is explained clearly worse then by the calibration that was ``better`` (None: by a mirrored one).
+    coded is explained clearly worse then by the calibration that was ``better`` (None: by a mirrored one)
+    and as it is by a background, where one is estimated: a power takes light and dark levels, too.
     """
     small, lit = _small(problem, QUICK[0]), problem.n_planes > 1
     if small.model == "local":
@@ -379,6 +380,8 @@ def _coded(
         return None
     straightened = tried(*how.straightened(*both))
     other = straightened.otherwise(better or FAR[0]).unexplained(background=lit)
+    if problem.smooth:
+        other = min(other, small.unexplained(background=True))
     if straightened.unexplained(background=lit) >= STRAIGHTER * other:
         return None
     return (

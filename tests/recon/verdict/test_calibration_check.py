@@ -389,6 +389,26 @@ def test_a_measured_photograph_that_is_coded_is_named_though_its_own_psf_wins(is
         assert "--srgb photograph" in check.sentences[1]
 
 
+@pytest.mark.skipif(
+    not (data_folder() / "diffusercam_hand").is_dir(), reason=f"the hand is not in {data_folder()}"
+)
+@pytest.mark.parametrize("is_coded", [False, True])
+def test_a_background_is_no_code_and_what_is_coded_under_even_light_is(is_coded: bool) -> None:
+    psfs, photograph = measured_set("hand")
+    if is_coded:
+        lit = np.maximum(photograph + 0.5 * photograph.mean(), 0)
+        seen = block_mean(np.round(255 * (lit / lit.max()) ** (1 / 2.2)), 8)
+    else:  # a thousandth of the counts on a dark level that was not taken off
+        noise = 0.25 * np.random.default_rng(1).standard_normal(block_mean(photograph, 8).shape)
+        seen = block_mean(photograph, 8) * 0.001 + 70 + noise
+    problem = choose(Problem.of(seen.astype(np.float32), block_mean(psfs[0], 8)))
+    assert problem.smooth
+    check = check_calibration(problem)
+    assert check is not None
+    assert check.fit is (Fit.OFF if is_coded else Fit.FITS)
+    assert (check.cause is not None and "gamma-coded" in check.cause[0]) is is_coded
+
+
 def test_a_psf_alone_is_not_called_coded_as_a_power_takes_a_pedestal_too() -> None:
     photograph, psfs = np.eye(4, dtype=np.float32), np.full((1, 1, 4, 4), 0.5, np.float32)
     psfs[..., 0, 0] = 1
