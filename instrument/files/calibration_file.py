@@ -41,6 +41,10 @@ _PLAIN_PSFS = (
     "PSF images by themselves tell no places: reconstruct takes one by --psf FILE, one a depth by "
     "--volume FOLDER."
 )
+_CUT_SWEEP = (
+    "It is a run: a sweep makes its calibration in the end. Where it was cut short, go on with it: "
+    "diffuserbench resume {}"
+)
 _FIELDS = ("shape", "source_positions_um", "geometry", "quality", "provenance", "sha256")
 
 
@@ -150,7 +154,9 @@ def find_calibration(folder: Path) -> Path:
         plain = not inside and any(
             f.suffix.lower() in (".tif", ".tiff", ".png", ".npy") for f in folder.iterdir()
         )
-        raise FileError(folder, f"holds {found}; exactly one is expected.", _PLAIN_PSFS if plain else "")
+        is_run = not inside and (folder / "state.json").is_file()
+        remedy = _CUT_SWEEP.format(folder) if is_run else _PLAIN_PSFS if plain else ""
+        raise FileError(folder, f"holds {found}; exactly one is expected.", remedy)
     return inside[0]
 
 

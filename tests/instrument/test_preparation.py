@@ -311,6 +311,12 @@ def test_a_folder_without_a_calibration_is_refused(tmp_path: Path, name: str, pa
         job_from_calibration(tmp_path / name, tmp_path / "raw.tif", InputOptions())
 
 
+def test_a_sweep_that_was_cut_short_is_named_as_what_can_go_on(tmp_path: Path) -> None:
+    (tmp_path / "state.json").write_text("{}")
+    with pytest.raises(FileError, match=f"holds no calibration.*resume {tmp_path}"):
+        find_calibration(tmp_path)
+
+
 def test_saturated_pixels_are_erased_when_asked_and_counted() -> None:
     image = psf_pixels()
     image[5, 5:8] = 4095
