@@ -426,7 +426,8 @@ def test_a_volume_is_offered_what_straightens_its_files(
     photograph, psf = seen
     psfs = np.stack([psf, transformed(psf, Transformation(scale=1.2))])[:n_depths, None]
     places = np.array([(0, 0, Z_UM), (0, 0, 2 * Z_UM)])[:n_depths]
-    left = iter((0.8, 0.2))
+    # Mirrored; as it is over a background, which volumes have estimated; straightened.
+    left = iter((0.8, 0.2) if n_depths == 1 else (0.8, 0.8, 0.2))
     monkeypatch.setattr(decoys, "coded", lambda *_, **__: Coded(psf=False))
     monkeypatch.setattr(decoys._Small, "unexplained", lambda *_, **__: next(left))
     problem = Problem.of(photograph, Calibration(psfs.astype(np.float32), places))
