@@ -47,6 +47,8 @@ class Behaviour:
         it can.
     help_of : callable, optional
         Returns what is said of one of the words to choose from; empty for nothing.
+    shown : callable
+        Returns how one of the words to choose from reads.
     offers : callable, optional
         Returns the words on offer now, where a device and not the declaration knows them.
     enabled_when : callable, optional
@@ -65,6 +67,7 @@ class Behaviour:
     needed_when: Callable[[], str] | None = None
     require: Callable[[Any], str] | None = None
     help_of: Callable[[str], str] | None = None
+    shown: Callable[[str], str] = str
     offers: Callable[[], Sequence[str]] | None = None
     enabled_when: Callable[[dict[str, Any]], str] | None = None
     beside: Callable[[], QWidget] | None = None
@@ -278,19 +281,21 @@ class ChoiceField(OptionField):
 
     def offer(self, words: Sequence[str]) -> None:
         """Offer these of its words; the default, else the first, where another was chosen."""
-        if [self.widget.itemText(i) for i in range(self._words_from, self.widget.count())] == list(words):
+        shown = [self.behaviour.shown(word) for word in words]
+        if [self.widget.itemText(i) for i in range(self._words_from, self.widget.count())] == shown:
             return
         with QSignalBlocker(self.widget):
             chosen = self.widget.currentText()
             while self.widget.count() > self._words_from:
                 self.widget.removeItem(self._words_from)
             self._add(words)
-            left = next((word for word in (chosen, self.option.default) if word in words), "")
-            self.widget.setCurrentIndex(max(self.widget.findText(str(left)), 0))
+            default = (self.behaviour.shown(word) for word in words if word == self.option.default)
+            left = chosen if chosen in shown else next(default, "")
+            self.widget.setCurrentIndex(max(self.widget.findText(left), 0))
 
     def _add(self, words: Sequence[str]) -> None:
         for word in words:
-            self.widget.addItem(word, read(self._spoken, word))
+            self.widget.addItem(self.behaviour.shown(word), read(self._spoken, word))
             said = "" if self.behaviour.help_of is None else self.behaviour.help_of(word)
             self.widget.setItemData(self.widget.count() - 1, said or None, Qt.ItemDataRole.ToolTipRole)
 

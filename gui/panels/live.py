@@ -17,7 +17,7 @@ from gui.panel import Panel, on_bench
 from gui.session import BenchSession
 from gui.way_on import ReconnectButton
 from gui.widgets.building import button, every, fill, in_row, label, split
-from gui.widgets.camera_controls import CameraForm
+from gui.widgets.camera_controls import CameraForm, trigger_words
 from gui.widgets.entry import NumberEdit
 from gui.widgets.live_picture import LivePicture
 from gui.widgets.record_bar import RecordBar
@@ -290,7 +290,8 @@ class LivePanel(Panel):
         words = f"Waiting for {'the first' if frame is None else 'a'} frame for {seconds:.0f} s."
         if state is not None and state.trigger_mode != "free_run":
             by = f"pulse on {state.trigger_line}" if state.trigger_mode == "hardware" else "program's trigger"
-            words += f" Trigger is “{state.trigger_mode}”: each {by} takes one; “free_run” needs none."
+            mode, free = trigger_words(state.trigger_mode), trigger_words("free_run")
+            words += f" Trigger is “{mode}”: each {by} takes one; “{free}” needs none."
         elif self.session.state("camera").simulated:
             words += (
                 " The simulated scene is computed once for each new light, at 5 megapixels some 5 s; "

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
@@ -38,9 +39,15 @@ _OFFERED = {
     "trigger_edge": "trigger_edges",
 }
 """Settings that are chosen, and what the camera offers for each."""
+_TRIGGERS = {"free_run": "none (free_run)", "software": "program (software)", "hardware": "pulse (hardware)"}
 _OF_HARDWARE = ("trigger_line", "trigger_edge")
 """Settings that mean nothing without a hardware trigger."""
 _SET = tuple(o.name for o in options_of(CameraOptions))
+
+
+def trigger_words(mode: str) -> str:
+    """Return what starts an exposure as an operator says it, the technical term beside it."""
+    return _TRIGGERS.get(mode, mode)
 
 
 class CameraForm(QWidget):
@@ -66,6 +73,7 @@ class CameraForm(QWidget):
         behaviours = {
             name: Behaviour(offers=partial(self._offered, offered)) for name, offered in _OFFERED.items()
         }
+        behaviours["trigger_mode"] = replace(behaviours["trigger_mode"], shown=trigger_words)
         behaviours["exposure_ms"] = Behaviour(beside=lambda: self.auto_button)
         self.form = OptionsForm([CameraOptions], behaviours, whole=False)
         self.widgets = self.form.widgets

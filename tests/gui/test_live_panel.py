@@ -283,7 +283,8 @@ def test_a_wrong_exposure_is_refused_at_the_field(qtbot: QtBot, live: LivePanel)
 
 def test_trigger_line_and_edge_are_chosen_from_what_the_camera_has(qtbot: QtBot, live: LivePanel) -> None:
     widgets = live.form.widgets
-    assert [widgets["trigger_mode"].itemText(n) for n in range(3)] == ["free_run", "software", "hardware"]
+    shown = [widgets["trigger_mode"].itemText(n) for n in range(3)]
+    assert shown == ["none (free_run)", "program (software)", "pulse (hardware)"]
     assert not widgets["trigger_edge"].isVisibleTo(live)
     widgets["trigger_mode"].setCurrentIndex(2)
     qtbot.waitUntil(lambda: live.form.state.trigger_mode == "hardware", timeout=WAIT_MS)
