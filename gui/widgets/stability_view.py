@@ -16,8 +16,8 @@ from PySide6.QtWidgets import QGraphicsItem, QGraphicsRectItem, QGraphicsSimpleT
 from gui.theme import colours, contrast, luminance
 from gui.widgets.building import choice, fill, in_row, label, offer
 from gui.widgets.image_view import ArrowKeys
-from gui.widgets.plots import curve_colour, curve_pen, legend, plot_widget
-from instrument.evaluation.figures import label_of, ticks_of
+from gui.widgets.plots import curve_pen, legend, plot_widget
+from instrument.evaluation.figures import boundary_lines, label_of, ticks_of
 from recon.verdict.map import Failure
 
 _SPAN = 1.0
@@ -53,7 +53,8 @@ class StabilityView(QWidget):
         self._cursor.setZValue(3)
         self._cursor.hide()
         self.keys.left.connect(self._cursor.hide)
-        self.boundaries: dict[str, npt.NDArray[np.float64]] = {}
+        self.boundaries: dict[str, list[npt.NDArray[np.float64]]] = {}
+        """The lines of each method's, across and up in cells."""
         fill(
             self,
             in_row((self.map, 2), (self.method, 1)),
@@ -103,10 +104,9 @@ class StabilityView(QWidget):
         self.plot.addItem(self._cursor, ignoreBounds=True)
         self._write_errors(_grid(methods[name]["error"]), cells)
         for number, (other, method) in enumerate(methods.items()):
-            self._draw_boundary(number, other, method["boundary"], record, chosen=other == name)
-        names = [
-            f"{other}{'' if method['boundary'] else ' (none here)'}" for other, method in methods.items()
-        ]
+            self.boundaries[other] = boundary_lines(_grid(method["severity"]))
+            self._draw_boundary(number, self.boundaries[other], chosen=other == name)
+        names = [f"{other}{'' if lines else ' (none here)'}" for other, lines in self.boundaries.items()]
         self.legend.setText(f"Boundaries: {legend(dict(enumerate(names)))}")
         for side, which in (("bottom", "x"), ("left", "y")):
             self.plot.setLabel(side, label_of(record[which]))
@@ -135,19 +135,14 @@ class StabilityView(QWidget):
         figures.setZValue(2)  # above the boundaries
         self.plot.addItem(figures, ignoreBounds=True)
 
-    def _draw_boundary(
-        self, number: int, name: str, points: Sequence[Sequence[float]], record: Any, *, chosen: bool
-    ) -> None:
-        places = np.array([(_place(record["x"], x), _place(record["y"], y)) for x, y in points], float)
-        self.boundaries[name] = places.reshape(-1, 2)
-        across, up = self.boundaries[name].T
-        # Not as one PlotDataItem, which takes three times as long.
-        line = pg.PlotCurveItem(across, up, pen=curve_pen(number, 4.0 if chosen else 2.0))
-        ends = pg.ScatterPlotItem(
-            across, up, size=9 if chosen else 6, pen=None, brush=pg.mkBrush(curve_colour(number))
-        )
-        for item in (line, ends):
-            self.plot.addItem(item, ignoreBounds=True)
+    def _draw_boundary(self, number: int, lines: Sequence[npt.NDArray[np.float64]], *, chosen: bool) -> None:
+        if not lines:
+            return
+        gap = np.full((1, 2), np.nan)
+        across, up = np.concatenate([part for line in lines for part in (line, gap)]).T
+        # Not as a PlotDataItem, which takes three times as long.
+        pen = curve_pen(number, 4.0 if chosen else 2.0)
+        self.plot.addItem(pg.PlotCurveItem(across, up, pen=pen, connect="finite"), ignoreBounds=True)
 
     def _moved(self, place: Any) -> None:
         point = self.plot.getPlotItem().vb.mapSceneToView(place)
@@ -211,14 +206,6 @@ def _coloured(level: npt.NDArray[np.float64]) -> npt.NDArray[np.uint8]:
     shown[~np.isfinite(level)] = pg.mkColor(now.line).getRgb()[:3]
     pixels: npt.NDArray[np.uint8] = np.round(shown).astype(np.uint8)
     return pixels
-
-
-def _place(axis: Mapping[str, Any], value: float) -> float:
-    """Return where a value lies between the cells of an axis, counted in cells."""
-    values = np.array(axis["values"], float)
-    if axis["logarithmic"]:
-        values, value = np.log(values), float(np.log(value))
-    return float(np.interp(value, values, np.arange(len(values))))
 
 
 def _stress(axis: Mapping[str, Any], index: int) -> str:

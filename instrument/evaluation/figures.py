@@ -7,9 +7,11 @@ import json
 from collections.abc import Iterable, Mapping
 from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
+import numpy.typing as npt
+from contourpy import LineType, contour_generator
 
 from instrument.evaluation.chart import ChartData, colours_of, title_of
 from instrument.evaluation.chart_figure import chart_figure
@@ -209,13 +211,13 @@ def _draw_map(axes: Axes, name: str, method: Mapping[str, Any], record: Mapping[
     level = np.log10(np.maximum(severity, 1e-2))
     image = axes.imshow(level, origin="lower", aspect="auto", cmap="BrBG_r", vmin=-1, vmax=1)
     n_y, n_x = severity.shape
+    for line in boundary_lines(severity):
+        axes.plot(*line.T, color=ACCENT, lw=2.2)
     for iy, ix in np.ndindex(n_y, n_x):
         error = method["error"][iy][ix]
         if error is not None:
             colour = "white" if abs(level[iy, ix]) > 0.75 else INK
             axes.text(ix, iy, f"{error:.2g}", ha="center", va="center", fontsize=7, color=colour)
-    if n_x > 1 and n_y > 1 and np.isfinite(level).all() and level.min() < 0 <= level.max():
-        axes.contour(level, levels=[0.0], colors=[ACCENT], linewidths=2.2)
     if (case := method.get("case")) is not None:
         axes.plot(*case, "o", ms=26, mfc="none", mec=INK, mew=2.5)
         axes.annotate(
@@ -228,6 +230,22 @@ def _draw_map(axes: Axes, name: str, method: Mapping[str, Any], record: Mapping[
         getattr(axes, f"set_{which}label")(label_of(about), fontsize=9, color=INK)
     axes.set_title(f"{name} (numbers: {record['error']})", fontsize=10, color=INK, loc="left")
     return image
+
+
+def boundary_lines(severity: npt.NDArray[np.float64]) -> list[npt.NDArray[np.float64]]:
+    """Return where a map (n_y, n_x) of severities crosses 1, as lines (points, 2) of x and y in cells.
+
+    Interpolated on the logarithm of the severity; NaN: not known, no line goes there. A map of one row or
+    column is one cell wide.
+    """
+    level = np.log10(np.maximum(severity, 1e-2))
+    places = []
+    for axis, n in enumerate(level.shape):
+        places.append(np.arange(n) if n > 1 else np.array([-0.5, 0.5]))
+        level = level if n > 1 else np.repeat(level, 2, axis)
+    known = np.ma.masked_invalid(level)
+    made = contour_generator(places[1], places[0], known, name="serial", line_type=LineType.Separate)
+    return cast(list[npt.NDArray[np.float64]], made.lines(0.0))
 
 
 def ticks_of(axis: Mapping[str, Any]) -> list[str]:

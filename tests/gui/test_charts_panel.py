@@ -14,7 +14,9 @@ from pytestqt.qtbot import QtBot
 from gui.panel import whole
 from gui.panels.charts import ChartsPanel, describe
 from instrument.evaluation.chart import read_chart
+from instrument.evaluation.figures import boundary_lines, map_figure
 from instrument.files.errors import FileError
+from instrument.files.figures import ACCENT
 from instrument.files.images import read_image
 from instrument.files.stability_file import read_stability
 from recon.verdict.cases import SHIPPED
@@ -81,8 +83,10 @@ def test_boundaries_colours_and_words_are_those_of_the_file(
     panel.open(made(tmp_path))
     view = panel.stability
     qtbot.waitUntil(lambda: view.map.currentText() == "Planted", timeout=WAIT_MS)
-    np.testing.assert_allclose(view.boundaries["admm tv"], [[1, 0], [1, 1]])
-    assert view.boundaries["fista"].shape == (0, 2)
+    (line,) = view.boundaries["admm tv"]
+    np.testing.assert_allclose(sorted(line.tolist()), [[1, 0], [1, 1]], atol=1e-9)
+    assert not view.boundaries["fista"]
+    assert "none" in view.legend.text()
     works, fails = view.image.image[0, 0].astype(int), view.image.image[0, 2].astype(int)
     assert works[1] > works[0] + 30
     assert fails[0] > fails[1] + 30
@@ -94,6 +98,27 @@ def test_boundaries_colours_and_words_are_those_of_the_file(
     assert view.describe(3, 0) == ""
     view.method.setCurrentText("fista")
     assert len(np.unique(view.image.image.reshape(-1, 3), axis=0)) == 1
+
+
+def test_the_printed_map_draws_the_boundaries_of_the_window(panel: ChartsPanel) -> None:
+    view, maps = panel.stability, read_stability(SHIPPED)["maps"]
+    for index, record in enumerate(maps.values()):
+        view.map.setCurrentIndex(index)
+        printed = map_figure(record)
+        for axes, (name, lines) in zip(printed.axes, view.boundaries.items(), strict=False):
+            drawn = [line.get_xydata() for line in axes.get_lines() if line.get_color() == ACCENT]
+            assert len(drawn) == len(lines), name
+            assert all(np.array_equal(one, other) for one, other in zip(drawn, lines, strict=True))
+
+
+def test_a_boundary_goes_round_what_is_not_known_and_through_a_map_of_one_row() -> None:
+    (line,) = boundary_lines(np.array([[0.1, 10.0]]))
+    np.testing.assert_allclose(sorted(line.tolist()), [[0.5, -0.5], [0.5, 0.5]])
+    severity = np.array([[0.1, 10.0, 10.0], [0.1, 10.0, np.nan], [np.nan, 10.0, 10.0]])
+    (line,) = boundary_lines(severity)
+    np.testing.assert_allclose(line[:, 0], 0.5)
+    np.testing.assert_allclose([line[:, 1].min(), line[:, 1].max()], [0.0, 1.5])
+    assert boundary_lines(np.full((3, 3), 0.5)) == []
 
 
 def test_figures_stand_on_their_cells_colour_above_the_boundaries(
