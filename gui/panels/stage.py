@@ -196,12 +196,13 @@ class StagePanel(DevicePanel):
         """Ask the stage where it is, whatever else is going on."""
         stage = self.session.bench.stage
         if stage is not None and self.is_ready and not self._reader.is_reading:
+            # Whether it moves first: where a stage at rest is, is where it stays.
             self._reader.ask(
-                lambda: (stage.position(), stage.is_homed, stage.is_moving, stage.needs_unlocking), self._show
+                lambda: (stage.is_moving, stage.position(), stage.is_homed, stage.needs_unlocking), self._show
             )
 
-    def _show(self, reading: tuple[dict[str, float], bool, bool, bool]) -> None:
-        position, is_homed, is_moving, is_locked = reading
+    def _show(self, reading: tuple[bool, dict[str, float], bool, bool]) -> None:
+        is_moving, position, is_homed, is_locked = reading
         self.unlock_button.setVisible(is_locked)
         self._here = position
         for name, row in self.rows.items():
@@ -209,7 +210,8 @@ class StagePanel(DevicePanel):
             row.position.setText(_place(here, row.target.shown_unit))
             travel = row.axis.upper_limit - row.axis.lower_limit
             row.gauge.setValue(round(_GAUGE * (here - row.axis.lower_limit) / travel) if travel else 0)
-            if row.target.value is None or not row.target.hasFocus():
+            # A field with the keyboard is filled once, after STOP: with where the stage comes to rest.
+            if (row.target.value is None and not is_moving) or not row.target.hasFocus():
                 row.target.set_value(round(here, 3))
         if is_moving:
             self.state.setText("Moving …  Esc stops")
