@@ -28,13 +28,13 @@ sys.path.append(str(Path(__file__).parents[1]))
 import gui_screenshots as shots
 from PySide6.QtCore import QRect, Qt, qInstallMessageHandler
 from PySide6.QtGui import QColor, QImage, QPainter
-from PySide6.QtTest import QTest
 
 from drivers.simulated.world import SimulatedWorld
 from gui.app import application
 from gui.main_window import MainWindow
 from gui.panels import PANELS
 from gui.theme import THEMES, apply_theme
+from tests.gui.event_loop import let_work
 from tests.gui.looks import faults
 
 STATES = ("empty", "filled", "failed")
@@ -104,7 +104,7 @@ def _pictures(
             for theme in themes:
                 window.set_theme(theme)
                 shots._wait(lambda window=window: not window.is_restyling, "the theme")
-                QTest.qWait(RESTYLED_MS)
+                let_work(RESTYLED_MS)
                 picture = window.grab().toImage()
                 picture.setDevicePixelRatio(1.0)  # in the screen's own pixels
                 yield name, theme, picture, faults(window)
@@ -157,7 +157,7 @@ def _come_to(window: MainWindow, name: str, state: str, out: Path) -> None:
             panel.options_form.set_values({"out": damaged.with_suffix(".npy")})
             panel.start()
             shots._wait(lambda: not panel.run.is_running, "the refusal")
-    QTest.qWait(shots.SETTLE_MS)
+    let_work(shots.SETTLE_MS)
 
 
 def _sheet(tiles: dict[tuple[str, str, str], QImage]) -> QImage:

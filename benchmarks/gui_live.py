@@ -13,6 +13,7 @@ import argparse
 import json
 import os
 import platform
+import sys
 import tempfile
 import time
 from datetime import UTC, datetime
@@ -20,9 +21,9 @@ from pathlib import Path
 from typing import Any
 
 os.environ.setdefault("QT_QPA_PLATFORM", "offscreen")
+sys.path.append(str(Path(__file__).parents[1]))
 
 from PySide6.QtCore import QSettings
-from PySide6.QtTest import QTest
 
 from gui.app import application
 from gui.main_window import MainWindow
@@ -31,6 +32,7 @@ from gui.session import BenchSession
 from gui.theme import apply_theme
 from instrument.bench.config_file import parse_config
 from instrument.bench.lit import LightState
+from tests.gui.event_loop import let_work, wait_until
 
 SIZES = {"0.3 MP": (480, 640), "1.0 MP": (1024, 1024), "1.3 MP": (1024, 1280), "5.5 MP": (2160, 2560)}
 BENCH = """
@@ -103,17 +105,17 @@ def measure(shape: tuple[int, int], rate: float, seconds: float) -> dict[str, An
         session.open()
         panel = window.panel("live")
         assert isinstance(panel, LivePanel)
-        until(lambda: panel.picture.frame is not None)
+        wait_until(lambda: panel.picture.frame is not None)
         panel.switch_light(LightState.SOURCE)
-        until(lambda: session.bench.source_lit)
+        wait_until(lambda: session.bench.source_lit)
         frame = panel.picture.frame
         assert frame is not None
         bright = 2 * frame.image.max()
-        until(lambda: panel.picture.frame is not None and panel.picture.frame.image.max() > bright)
-        QTest.qWait(2500)
+        wait_until(lambda: panel.picture.frame is not None and panel.picture.frame.image.max() > bright)
+        let_work(2500)
         shown = _Count(panel)
         before, acquired = _Clock(), session.live.status()
-        QTest.qWait(int(1e3 * seconds))
+        let_work(int(1e3 * seconds))
         spent = _Clock().since(before)
         after = session.live.status()
         result = {
@@ -124,15 +126,15 @@ def measure(shape: tuple[int, int], rate: float, seconds: float) -> dict[str, An
             "window_thread_share": spent.thread_s / spent.wall_s,
         }
         session.viewing.hold()
-        until(lambda: not session.live.is_running)
+        wait_until(lambda: not session.live.is_running)
         idle = _Clock()
-        QTest.qWait(int(1e3 * seconds / 2))
+        let_work(int(1e3 * seconds / 2))
         standing = _Clock().since(idle)
         session.viewing.start()
         window.hide()
-        QTest.qWait(1000)
+        let_work(1000)
         before = _Clock()
-        QTest.qWait(int(1e3 * seconds / 2))
+        let_work(int(1e3 * seconds / 2))
         alone = _Clock().since(before)
         result["camera_alone_share"] = alone.process_s / alone.wall_s
         # What a frame costs beyond the window standing still, and what that makes at 30 frames a second:
@@ -142,7 +144,7 @@ def measure(shape: tuple[int, int], rate: float, seconds: float) -> dict[str, An
         result["frame_ms"] = 1e3 * extra_s / max(1, shown.count)
         result["share_at_30_per_s"] = still + 30 * result["frame_ms"] / 1e3
         session.close()
-        until(lambda: session.is_closed)
+        wait_until(lambda: session.is_closed)
         session.join()
         window.deleteLater()
     return result
@@ -177,15 +179,6 @@ class _Count:
             show(*arguments)
 
         panel.picture.view.show_image = counted  # type: ignore[method-assign]
-
-
-def until(done: Any, timeout_s: float = 300.0) -> None:
-    """Let the window work until something is done."""
-    deadline_s = time.monotonic() + timeout_s
-    while not done():
-        if time.monotonic() > deadline_s:
-            raise SystemExit("Waited five minutes in vain; see the log above.")
-        QTest.qWait(20)
 
 
 if __name__ == "__main__":

@@ -14,12 +14,12 @@ import argparse
 import os
 import re
 import sys
-import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 os.environ.setdefault("QT_QPA_PLATFORM", "offscreen")
+sys.path.append(str(Path(__file__).parents[1]))
 
 import numpy as np
 from PySide6.QtCore import (
@@ -48,6 +48,7 @@ from instrument.bench.config_file import parse_config
 from instrument.cli import main as command
 from instrument.files.images import write_image
 from instrument.files.sample_images import load_sample
+from tests.gui.event_loop import let_work, wait_until
 
 SIZE = "1600x980"
 WAIT_S = 900.0
@@ -183,7 +184,7 @@ def _open(folder: Path, width: int, height: int) -> MainWindow:
     _wait(lambda: bool(opened), "the bench to open")
     if folder.name == "camera":
         _wait(lambda: _is_lit(session), "the first frame with light")
-    QTest.qWait(SETTLE_MS)
+    let_work(SETTLE_MS)
     return window
 
 
@@ -201,7 +202,7 @@ def _close(window: MainWindow) -> None:
 
 def _show(window: MainWindow, name: str, out: Path) -> None:
     window.show_panel(name)
-    QTest.qWait(SETTLE_MS)
+    let_work(SETTLE_MS)
     if name == "reconstructions":
         _reconstructions(window, out)
         return
@@ -290,7 +291,7 @@ def _drag(view: Any, start: tuple[float, float], end: tuple[float, float]) -> No
             Qt.KeyboardModifier.NoModifier,
         )  # QTest's own hold no button
         QCoreApplication.sendEvent(port, move)
-        QTest.qWait(60)  # pyqtgraph thins out what comes sooner
+        let_work(60)  # pyqtgraph thins out what comes sooner
     QTest.mouseRelease(port, Qt.MouseButton.LeftButton, pos=places[1])
 
 
@@ -330,7 +331,7 @@ def _type(panel: Any, numbers: dict[str, str]) -> None:
         field.setFocus()
         field.selectAll()
         QTest.keyClicks(field, text)
-    QTest.qWait(SETTLE_MS)
+    let_work(SETTLE_MS)
     _wait(lambda: panel.run_bar.start_button.isEnabled(), "the form to be right")
 
 
@@ -433,7 +434,7 @@ def _align(window: MainWindow) -> None:
 
 
 def _grab(window: MainWindow, path: Path) -> None:
-    QTest.qWait(SETTLE_MS)
+    let_work(SETTLE_MS)
     if not window.grab().save(str(path)):
         raise SystemExit(f"{path}: could not be written.")
     print(path)
@@ -449,11 +450,10 @@ def _wait_for(job: Job | None, panel: Panel) -> None:
 
 
 def _wait(until: Callable[[], bool], what: str) -> None:
-    end_s = time.monotonic() + WAIT_S
-    while not until():
-        if time.monotonic() > end_s:
-            raise SystemExit(f"Waited {WAIT_S:g} s for {what} in vain.")
-        QTest.qWait(50)
+    try:
+        wait_until(until, WAIT_S)
+    except TimeoutError:
+        raise SystemExit(f"Waited {WAIT_S:g} s for {what} in vain.") from None
 
 
 def _quietly(kind: QtMsgType, _context: object, text: str) -> None:

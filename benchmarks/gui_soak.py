@@ -40,6 +40,8 @@ import numpy as np
 from PySide6.QtCore import QSettings, Qt
 from PySide6.QtTest import QTest
 
+from tests.gui.event_loop import let_work, wait_until
+
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from benchmarks.gui_stalls import Turns
@@ -167,21 +169,21 @@ class Soak:
         self.window.resize(1600, 980)
         self.session.open()
         self.live = self._panel("live", LivePanel)
-        until(lambda: self.live.picture.frame is not None)
+        wait_until(lambda: self.live.picture.frame is not None)
         self.preview = self._panel("live_reconstruction", LiveReconstructionPanel)
         self.stage = self._panel("stage", StagePanel)
         self.leds = self._panel("led_array", LedPanel)
         self.slm = self._panel("slm", SlmPanel)
-        until(lambda: not self.session.jobs.device_jobs)
+        wait_until(lambda: not self.session.jobs.device_jobs)
         self.preview.file.setText(str(self._calibrate()))
         self.preview.load()
-        until(lambda: self.preview._shown is not None)
+        wait_until(lambda: self.preview._shown is not None)
         self.window.show_panel("stage")
         stage, self.array = self.session.bench.stage, self.session.bench.led_array
         assert stage is not None
         assert isinstance(self.array, SimulatedLedArray)
         homing = self.session.jobs.device("home", lambda _: stage.home(), {"stage"})
-        until(lambda: homing.is_over)
+        wait_until(lambda: homing.is_over)
         self.turns = Turns()
         self._n_shown = 0
         show = self.live.picture.view.show_image
@@ -210,7 +212,7 @@ class Soak:
         self._mark()
         self.turns.fetch()
         while (now_s := time.monotonic()) - began_s < seconds:
-            QTest.qWait(20)
+            let_work(20)
             if now_s >= next_sample_s:
                 rests = now_s >= next_rest_s
                 self.sample(now_s - began_s, rests=rests)
@@ -232,22 +234,22 @@ class Soak:
         """Another LED pattern, then the scene again."""
         names = list(self.leds.pattern_buttons)
         self.leds.show_pattern(names[int(self.rng.integers(len(names)))])
-        QTest.qWait(500)
+        let_work(500)
         QTest.mouseClick(self.live.light_buttons.buttons()[0], Qt.MouseButton.LeftButton)
 
     def photograph(self) -> None:
         """Take a photograph by its key; kept files are removed, as they would fill the disk."""
         QTest.keyClick(self.window, Qt.Key.Key_K, Qt.KeyboardModifier.ControlModifier)
-        until(lambda: not self.session.jobs.device_jobs)
+        wait_until(lambda: not self.session.jobs.device_jobs)
         shutil.rmtree(self.session.runs_folder / "photographs", ignore_errors=True)
 
     def record(self) -> None:
         """Record for about two seconds, by its key."""
         QTest.keyClick(self.window, Qt.Key.Key_R, Qt.KeyboardModifier.ControlModifier)
-        QTest.qWait(2000)
+        let_work(2000)
         if self.live.record_bar.job is not None:
             QTest.keyClick(self.window, Qt.Key.Key_R, Qt.KeyboardModifier.ControlModifier)
-        until(lambda: self.session.jobs.exclusive_job is None)
+        wait_until(lambda: self.session.jobs.exclusive_job is None)
         self._clear_runs()
 
     def plan(self) -> None:
@@ -259,7 +261,7 @@ class Soak:
             prepare(session.bench, plan, session.runs_folder, on_progress=context.report).execute()
 
         job = session.exclusive_job("A plan", work)
-        until(lambda: job.is_over)
+        wait_until(lambda: job.is_over)
         self._dark("a run")
         QTest.mouseClick(self.live.light_buttons.buttons()[0], Qt.MouseButton.LeftButton)
         self._clear_runs()
@@ -268,12 +270,12 @@ class Soak:
         """Look at the other panels and come back."""
         for name in ("slm", "led_array", "stage"):
             self.window.show_panel(name)
-            QTest.qWait(150)
+            let_work(150)
 
     def stop(self) -> None:
         """STOP, then light again."""
         QTest.keyClick(self.window, Qt.Key.Key_Escape)
-        until(lambda: not self.session._stopping)
+        wait_until(lambda: not self.session._stopping)
         self._dark("STOP")
         QTest.mouseClick(self.live.light_buttons.buttons()[0], Qt.MouseButton.LeftButton)
 
@@ -346,7 +348,7 @@ class Soak:
         for panel in self.window._panels.values():
             panel.shutdown()
         self.session.close()
-        until(lambda: self.session.is_closed)
+        wait_until(lambda: self.session.is_closed)
         self.session.join()
 
     def left(self) -> list[str]:
@@ -438,15 +440,6 @@ def at_rest_mb() -> float:
     if hand_back := getattr(ctypes.CDLL(None), "malloc_trim", None):
         hand_back(ctypes.c_size_t(0))
     return resident_mb()
-
-
-def until(done: Any, timeout_s: float = 300.0) -> None:
-    """Let the window work until something is done."""
-    deadline_s = time.monotonic() + timeout_s
-    while not done():
-        if time.monotonic() > deadline_s:
-            raise SystemExit("Waited five minutes in vain.")
-        QTest.qWait(20)
 
 
 def draw(samples: list[dict[str, Any]], done: dict[str, int], minutes: float, path: Path) -> None:

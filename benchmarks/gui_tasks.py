@@ -32,6 +32,7 @@ from gui.theme import apply_theme
 from instrument.files.images import write_image
 from instrument.files.sample_images import load_sample
 from instrument.tasks import TASKS
+from tests.gui.event_loop import let_work
 from tests.gui.looks import faults
 
 SWEEP = ["--z-min", "22", "--z-max", "80", "--planes", "3"]
@@ -139,10 +140,10 @@ def _carried_out(panel: TasksPanel, name: str, made: dict[str, dict[str, Any]]) 
         QTest.keyClick(panel.choice, Qt.Key.Key_Down)
     shots._wait(lambda: panel.name == name and name in panel._pages, "the form")
     panel._pages[name].form.set_values(made.get(name, {}))
-    QTest.qWait(300)
+    let_work(300)
     QTest.mouseClick(panel.run_bar.start_button, Qt.MouseButton.LeftButton)
     if not panel.run.is_running and not ended:
-        QTest.qWait(300)
+        let_work(300)
     shots._wait(lambda: not panel.run.is_running, f"{name} to end")
     for connection in told:
         panel.disconnect(connection)

@@ -12,16 +12,16 @@ from __future__ import annotations
 
 import argparse
 import os
+import sys
 import tempfile
 import time
-from collections.abc import Callable
 from pathlib import Path
 
 os.environ.setdefault("QT_QPA_PLATFORM", "offscreen")
+sys.path.append(str(Path(__file__).parents[1]))
 
 import numpy as np
 from PySide6.QtCore import QTimer, qInstallMessageHandler
-from PySide6.QtTest import QTest
 
 from gui.app import application
 from gui.jobs import JobRunner
@@ -29,6 +29,7 @@ from gui.panel import whole
 from gui.theme import apply_theme
 from gui.widgets.volume_view import VolumeView
 from instrument.reconstruction.stored_result import export_result, open_result
+from tests.gui.event_loop import let_work, wait_until
 
 TICK_MS = 5
 WAIT_S = 300.0
@@ -59,9 +60,9 @@ def main() -> None:
         assert result.volume is not None
         view.open(result.volume)
         late.reset()
-        _wait(lambda: "z" in view.slices)
+        wait_until(lambda: "z" in view.slices)
         print(f"first slice after     {time.perf_counter() - start_s:.2f} s")
-        _wait(lambda: view.projections is not None)
+        wait_until(lambda: view.projections is not None)
         print(
             f"projections after     {time.perf_counter() - start_s:.2f} s "
             f"({time.process_time() - cpu_s:.2f} s of processor)"
@@ -71,12 +72,12 @@ def main() -> None:
         late.reset()
         for plane in range(0, shape[0], 2):
             view.slider.setValue(plane)
-            QTest.qWait(10)
-        _wait(lambda: view.slices["z"].index == view.point[0])
+            let_work(10)
+        wait_until(lambda: view.slices["z"].index == view.point[0])
         late.tell("while the slider is pulled")
         view.set_mode("turning")
         canvas = view.turning.canvas
-        _wait(lambda: canvas.pixels is not None)
+        wait_until(lambda: canvas.pixels is not None)
         late.reset()
         _turn(view)
         late.tell("while it turns")
@@ -118,7 +119,7 @@ def _turn(view: VolumeView) -> None:
     for _ in range(TURNS):
         before = canvas.pixels
         canvas.turn(360 / TURNS, 0.0)
-        _wait(lambda before=before: canvas.pixels is not before)  # type: ignore[misc]
+        wait_until(lambda before=before: canvas.pixels is not before)  # type: ignore[misc]
         shown += 1
     wall_s, cpu_s = time.perf_counter() - start_s, time.process_time() - cpu_s
     print(
@@ -140,14 +141,6 @@ def _write(folder: Path, shape: tuple[int, ...], suffix: str) -> Path:
     export_result(open_result(plain), path)
     plain.unlink()
     return path
-
-
-def _wait(until: Callable[[], bool]) -> None:
-    end_s = time.monotonic() + WAIT_S
-    while not until():
-        if time.monotonic() > end_s:
-            raise SystemExit(f"Waited {WAIT_S:g} s in vain.")
-        QTest.qWait(5)
 
 
 if __name__ == "__main__":

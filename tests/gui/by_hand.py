@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,6 +17,7 @@ from gui.session import BenchSession
 from gui.widgets.dialogues import TextWindow
 from instrument.bench.config import BenchConfig
 from instrument.bench.config_file import no_bench
+from tests.gui.event_loop import wait_until
 
 KEY, CONTROL = Qt.Key, Qt.KeyboardModifier.ControlModifier
 
@@ -52,10 +52,7 @@ class Operator:
 
     def wait(self, until: Callable[[], object]) -> None:
         """Let the window work until something is so."""
-        end_s = time.monotonic() + self._wait_s
-        while not until():
-            assert time.monotonic() < end_s, f"waited {self._wait_s:g} s in vain"
-            QTest.qWait(10)
+        wait_until(until, self._wait_s)
 
     def panel(self, name: str) -> Any:
         """Return a panel, once it is made."""
