@@ -6,6 +6,7 @@ import json
 from dataclasses import replace
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
@@ -203,6 +204,24 @@ def test_what_cannot_be_written_is_refused_and_leaves_nothing(tmp_path: Path) ->
     with pytest.raises(FileError, match="does not exist"):
         export(run, tmp_path / "nowhere" / "a.tif")
     assert sorted(path.name for path in tmp_path.iterdir()) == sorted(["old.tif", run.path.name])
+
+
+def test_room_for_all_that_is_written_is_asked_for_before(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run = a_recording(tmp_path, colour=False)
+    room = SimpleNamespace(free=3 * run.array.frame_bytes)
+
+    monkeypatch.setattr(
+        "instrument.files.atomic.os.statvfs",
+        lambda _: SimpleNamespace(f_flag=0, f_blocks=1, f_bavail=room.free, f_frsize=1),
+    )
+    assert export(run, tmp_path / "a.npy", [0, 1, 2]) == [0, 1, 2]
+    with pytest.raises(FileError, match=r"needs 0.0 MB, and 0.0 MB are free"):
+        export(run, tmp_path / "b.npy", [0, 1, 2, 4])
+    assert not (tmp_path / "b.npy").exists()
+    room.free = 0  # a film's size nobody knows before
+    assert export(run, tmp_path / "a.mp4", [0, 1]) == [0, 1]
 
 
 def test_from_the_command_line(

@@ -200,6 +200,20 @@ def test_an_array_keeps_what_was_written_and_nothing_half_written(
             array.write([(index, image)])
 
 
+def test_an_arrays_name_is_on_the_disk_once_it_is_made(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It is made under another name: what syncs the folder before knows that one alone."""
+    synced: list[list[str]] = []
+    monkeypatch.setattr(
+        frame_array, "sync_folder", lambda path: synced.append([p.name for p in path.iterdir()])
+    )
+    FrameArray.create(
+        tmp_path / "frames", n_frames=1, frame_shape=(6, 8), dtype="uint16", pixel_pitch_um=2.5, name="a"
+    )
+    assert synced == [["frames"]]
+
+
 def test_frames_that_came_at_one_time_have_no_period() -> None:
     def period_s(*times_ns: int | None) -> float | None:
         metadata = [
