@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from calibration_routines.demos.chart import chart_of
-from calibration_routines.demos.journal import Stages, state_of, told_in, world_of
+from calibration_routines.demos.journal import Stages, demo_bench, told_in, world_of
 from calibration_routines.demos.measured import Measured
 from calibration_routines.demos.picture import Viewer, compare
 from calibration_routines.demos.result import DemoResult
@@ -23,9 +23,7 @@ from calibration_routines.psf.exposure import expose_scene
 from calibration_routines.psf.sweep import calibrate_sweep
 from calibration_routines.psf.sweep_plan import expose_sweep, plan_lines, sweep_plan
 from calibration_routines.psf.sweep_procedure import quality_lines
-from instrument.bench.bench import Bench, open_bench
-from instrument.bench.config_file import parse_config
-from instrument.files.atomic import write_text
+from instrument.bench.bench import Bench
 from recon import reconstruct
 from recon.optics.scene import Scene
 
@@ -51,19 +49,8 @@ def run_demo(
 
 def _run(place: Path, listener: Listener, settings: DemoSettings, stages: Stages) -> DemoResult:
     stage, journal = stages.stage, stages.journal
-    write_text(place / "bench.toml", settings.bench_toml())
-    with stage("open the bench"):
-        bench = open_bench(parse_config(settings.bench_toml(), place / "bench.toml"))
-    with bench:
-        bench.foretell(bench.config.bench.name)
-        journal.note(simulated=bool(bench.simulated_kinds), bench=bench.label)
-        listener.said(f"Bench: {bench.label}")
-        listener.said(f"Everything goes to {place}")
-        try:
-            measured = _measure(bench, place, settings, listener, stages)
-        finally:
-            bench.stop()
-            journal.note(left=state_of(bench))
+    with demo_bench(settings.bench_toml(), place, listener, stages) as bench:
+        measured = _measure(bench, place, settings, listener, stages)
         viewer = Viewer(world_of(bench), settings, measured)
     with stage("compile kernels (kept)"):
         _warm_up()

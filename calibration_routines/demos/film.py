@@ -15,15 +15,13 @@ import numpy as np
 
 from calibration_routines.demos.film_figure import write_film_figure
 from calibration_routines.demos.film_judge import FOLLOWED, ROI_UM, Judged, Truth, judge, truth_of
-from calibration_routines.demos.journal import Stages, state_of, told_in, world_of
+from calibration_routines.demos.journal import Stages, demo_bench, told_in, world_of
 from calibration_routines.procedure import Listener
 from calibration_routines.psf.sweep import calibrate_sweep
 from calibration_routines.psf.sweep_options import LateralSweep
 from calibration_routines.psf.sweep_procedure import quality_lines
 from drivers.simulated.world import SimulatedWorld
-from instrument.bench.bench import Bench, open_bench
-from instrument.bench.config_file import parse_config
-from instrument.files.atomic import write_text
+from instrument.bench.bench import Bench
 from instrument.reconstruction.activity import (
     WINDOW_S,
     Activity,
@@ -133,19 +131,8 @@ def run_film(
 
 def _run(place: Path, listener: Listener, settings: FilmSettings, stages: Stages) -> FilmResult:
     stage, journal = stages.stage, stages.journal
-    write_text(place / "bench.toml", settings.bench_toml())
-    with stage("open the bench"):
-        bench = open_bench(parse_config(settings.bench_toml(), place / "bench.toml"))
-    with bench:
-        bench.foretell(bench.config.bench.name)
-        journal.note(simulated=bool(bench.simulated_kinds), bench=bench.label)
-        listener.said(f"Bench: {bench.label}")
-        listener.said(f"Everything goes to {place}")
-        try:
-            calibration, run = _filmed(bench, place, settings, listener, stages)
-        finally:
-            bench.stop()
-            journal.note(left=state_of(bench))
+    with demo_bench(settings.bench_toml(), place, listener, stages) as bench:
+        calibration, run = _filmed(bench, place, settings, listener, stages)
         world = world_of(bench)
     with stage("reconstruct the film"):
         video, model = _reconstructed(place, calibration, run, settings, stages)

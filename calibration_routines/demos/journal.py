@@ -12,7 +12,8 @@ from typing import Any
 
 from calibration_routines.procedure import Listener
 from drivers.simulated.world import SimulatedWorld
-from instrument.bench.bench import Bench
+from instrument.bench.bench import Bench, open_bench
+from instrument.bench.config_file import parse_config
 from instrument.files.atomic import write_text
 from instrument.files.errors import FileError
 from instrument.runs.interrupts import ctrl_c_remembered
@@ -110,6 +111,25 @@ def told_in(parent: Path, kind: str, listener: Listener) -> Iterator[tuple[Path,
         journal.note(state="aborted" if aborted else "failed", error=str(error) or type(error).__name__)
         error.add_note(f"The demo {'was stopped' if aborted else 'failed'}; what it made is in {place}")
         raise
+
+
+@contextmanager
+def demo_bench(config_toml: str, place: Path, listener: Listener, stages: Stages) -> Iterator[Bench]:
+    """Open a demo's bench, kept as ``bench.toml`` in its folder; however it ends, stopped and said to be."""
+    journal, path = stages.journal, place / "bench.toml"
+    write_text(path, config_toml)
+    with stages.stage("open the bench"):
+        bench = open_bench(parse_config(config_toml, path))
+    with bench:
+        bench.foretell(bench.config.bench.name)
+        journal.note(simulated=bool(bench.simulated_kinds), bench=bench.label)
+        listener.said(f"Bench: {bench.label}")
+        listener.said(f"Everything goes to {place}")
+        try:
+            yield bench
+        finally:
+            bench.stop()
+            journal.note(left=state_of(bench))
 
 
 def world_of(bench: Bench) -> SimulatedWorld:

@@ -186,7 +186,7 @@ def test_whatever_ends_it_the_bench_is_safe_and_the_record_says_so(
         benches.append(open_bench(config))
         return benches[0]
 
-    monkeypatch.setattr("calibration_routines.demos.camera.open_bench", opened)
+    monkeypatch.setattr("calibration_routines.demos.journal.open_bench", opened)
     with pytest.raises(type(trouble)):
         run_demo(tmp_path, Troubling(stage, trouble), SMALL)
     (folder,) = tmp_path.iterdir()
