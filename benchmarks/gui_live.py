@@ -112,6 +112,7 @@ def measure(shape: tuple[int, int], rate: float, seconds: float) -> dict[str, An
         assert frame is not None
         bright = 2 * frame.image.max()
         wait_until(lambda: panel.picture.frame is not None and panel.picture.frame.image.max() > bright)
+        wait_until(lambda: not session.jobs.jobs)  # panels prepared, kernels compiled: once
         let_work(2500)
         shown = _Count(panel)
         before, acquired = _Clock(), session.live.status()

@@ -143,7 +143,8 @@ class FrameFigures:
         """Return the figures of a histogram of all counts."""
         there = np.flatnonzero(counts)
         total = float(counts.sum(dtype=np.float64))
-        mean = float(np.dot(np.arange(len(counts)), counts.astype(np.float64))) / total
+        # Not by a dot product: BLAS wakes a thread for one of 65536, which then spins until the next frame.
+        mean = float((there * counts[there].astype(np.float64)).sum()) / total
         saturated = float(counts[full_scale:].sum(dtype=np.float64)) / total
         return cls(int(there[0]), int(there[-1]), mean, full_scale, saturated)
 

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import os
+import subprocess
+import sys
 import threading
 from datetime import UTC, datetime
 from typing import Any, NoReturn
@@ -109,6 +112,27 @@ def test_figures_of_a_frame_are_those_of_its_counts() -> None:
     few = np.zeros(16, np.float32)
     few[5] = 1
     assert FrameFigures.of(few, 15).span == (5, 5)
+
+
+def test_figures_of_thirty_frames_a_second_keep_no_other_thread_busy() -> None:
+    script = """
+import time
+import numpy as np
+from instrument.live.frame_view import FrameFigures
+counts = np.ones(65536, np.float32)
+FrameFigures.of(counts, 65535)
+own_s, all_s = time.thread_time(), time.process_time()
+for _ in range(30):
+    FrameFigures.of(counts, 65535)
+    time.sleep(1 / 30)
+own_s = time.thread_time() - own_s
+print((time.process_time() - all_s) / own_s)
+"""  # in a process of its own, where no other test's threads are
+    environment = {name: value for name, value in os.environ.items() if name != "OPENBLAS_NUM_THREADS"}
+    done = subprocess.run(
+        [sys.executable, "-c", script], env=environment, check=True, capture_output=True, text=True
+    )
+    assert float(done.stdout) < 2
 
 
 def test_percentiles_are_of_pixels_and_apart() -> None:
