@@ -111,6 +111,7 @@ class MainWindow(QMainWindow):
         self._show_simulated()
         self.panel("log")  # from the first line on
         self.tabs.currentChanged.connect(self._fill_current)
+        self.tabs.currentChanged.connect(self.status.leave_panel)
         self._fill_current()
 
     def change_bench(self, config: BenchConfig) -> None:

@@ -20,7 +20,7 @@ _LOOK_MS = 300
 
 
 class StatusLine(QStatusBar):
-    """Says which job runs, or how the last one ended; warnings and errors, until their cause is gone."""
+    """Says which job runs, or how the last one ended; errors until their cause is gone, others where told."""
 
     def __init__(self, session: BenchSession, parent: QWidget | None = None) -> None:
         super().__init__(parent)
@@ -40,6 +40,8 @@ class StatusLine(QStatusBar):
         self._look.timeout.connect(self._show_compiling)
         self._problem = ""
         """The warning or error that was told last."""
+        self._stays = False
+        """Whether it holds whatever panel is in front: an error that is no panel's own."""
         session.jobs.job_started.connect(self._started)
         session.jobs.job_ended.connect(self._ended)
         session.logged.connect(self._show_problem)
@@ -61,6 +63,8 @@ class StatusLine(QStatusBar):
     def _ended(self, job: Job) -> None:
         if job.quiet:
             return
+        if not job.lanes and self._problem.startswith(f"{job.title}: "):  # its panel says it, too
+            self._stays = False
         running = self.jobs
         self.progress.setVisible(any(j.exclusive or not j.lanes for j in running))
         if running:
@@ -78,13 +82,22 @@ class StatusLine(QStatusBar):
 
     def _show_problem(self, level: str, text: str) -> None:
         if level in ("warning", "error"):
-            self._problem = text
-            self.words.setText(text.splitlines()[0][:_MOST_CHARACTERS])
+            self._problem, self._stays = text, level == "error"
+            self.words.setText(self._shown_problem)
+
+    @property
+    def _shown_problem(self) -> str:
+        return self._problem.splitlines()[0][:_MOST_CHARACTERS] if self._problem else ""
+
+    def leave_panel(self) -> None:
+        """Take away what concerned the panel that was in front: it says so itself, and the log keeps it."""
+        if self._problem and not self._stays and self.words.text() == self._shown_problem:
+            self.words.setText(f"{self.jobs[0].title} …" if self.jobs else "Ready")
 
     def _forget_problem(self, kind: str) -> None:
         """Take a device's failure away that is over; the log keeps it."""
         session = self._session
         device = session.bench.devices.get(cast(Kind, kind))
         mended = device is not None and session.is_open(kind) and in_the_window(device.name) in self._problem
-        if mended and self.words.text() == self._problem.splitlines()[0][:_MOST_CHARACTERS]:
+        if mended and self.words.text() == self._shown_problem:
             self.words.setText("Ready")

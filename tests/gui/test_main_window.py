@@ -27,6 +27,7 @@ from gui.widgets.building import every
 from gui.widgets.dialogues import Question, TextWindow, choose_path
 from instrument.bench.bench import Bench
 from instrument.bench.lit import LightState
+from instrument.files.errors import BenchError
 from tests.gui.looks import faults
 
 WAIT_MS = 60_000
@@ -342,6 +343,35 @@ def test_stop_takes_clicks_while_a_text_is_open_and_the_text_goes_when_closed(
         qtbot.mouseClick(window.stop_button, Qt.MouseButton.LeftButton)
     with qtbot.waitSignal(text.destroyed, timeout=WAIT_MS):
         text.reject()
+
+
+def test_what_a_panel_warned_of_leaves_the_last_line_with_it_and_the_failure_of_a_device_does_not(
+    qtbot: QtBot, window: MainWindow
+) -> None:
+    session, words = window.session, window.status.words
+
+    def fail(_: JobContext) -> None:
+        raise BenchError("a.npy and b.npy have different sizes.")
+
+    session.log("warning", "The result fails in 3 of 10 pictures like it.")
+    window.bring("tasks")
+    assert words.text() == "Ready"
+    job = session.jobs.compute("Compare", fail)
+    qtbot.waitUntil(lambda: job.is_over, timeout=WAIT_MS)
+    assert "different sizes" in words.text()
+    window.bring("live")
+    assert words.text() == "Ready"
+    job = session.jobs.device("Homing the stage", fail, {"stage"})
+    qtbot.waitUntil(lambda: job.is_over, timeout=WAIT_MS)
+    window.bring("tasks")
+    assert "different sizes" in words.text()
+    gate = threading.Event()
+    job = session.jobs.compute("Analyze", lambda _: gate.wait(WAIT_MS / 1000))
+    qtbot.waitUntil(lambda: job.state is JobState.RUNNING, timeout=WAIT_MS)
+    session.log("warning", "Two of the planes are the same.")
+    window.bring("live")
+    assert words.text() == "Analyze …", "what runs is named again"
+    gate.set()
 
 
 def test_closing_asks_before_a_short_job_is_broken_off_and_not_before_a_listing(
