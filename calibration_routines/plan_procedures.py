@@ -16,9 +16,7 @@ from calibration_routines.purpose import REFUSED, completed
 from calibration_routines.routine import Routine, routines
 from instrument.bench.bench import Bench
 from instrument.bench.photograph import Snapshot
-from instrument.files.calibration_file import load_calibration
 from instrument.files.errors import BenchError, count
-from instrument.files.reading import parse_json, read_bytes
 from instrument.plan import Plan, Step, check, estimate
 from instrument.plan.illumination import IlluminationOptions
 from instrument.runs.acquire import abilities_of, acquire, look, prepare_resume, settle
@@ -137,7 +135,7 @@ class ResumeProcedure(Procedure):
         if run.condition is RunCondition.COMPLETED and lacks_result(self.run):
             for words in frames.verdict:
                 listener.said(words)
-        return finished(run, bench, control, listener) or frames
+        return finished(run, bench, control, listener) or _with_damage(frames, looked)
 
 
 def _restore_after_gaps(runner: Runner, restore: Callable[[int], None], todo: Sequence[int]) -> None:
@@ -158,7 +156,7 @@ def settled(
     path: Path, found: Verification, bench: Bench | None, control: RunControl, listener: Listener
 ) -> Outcome:
     """Mend a run that needs no frames taken, and make the result that it lacks (``bench`` if it is open)."""
-    done, damage = settle(path, found), ""
+    done = settle(path, found)
     run = Run.open(path)
     if run.plan is None:
         words = f"a recording, {found.condition}; there is nothing to go on with."
@@ -172,29 +170,21 @@ def settled(
     else:
         words = f"complete already, {run.n_frames} frames read back, all as they were written."
         if result := result_of(path):
-            damage = _damage_of(result)
-            words += f" But what was made of them is damaged: {damage}" if damage else ""
             words += f" To have them analysed again, move {result} away first."
     if lacks_result(path):
         for line in (*done, words):
             listener.said(line)
-    return finished(run, bench, control, listener) or Outcome(
-        verdict=(*done, words), good=not damage, runs=(path,), result=run
+    return finished(run, bench, control, listener) or _with_damage(
+        Outcome(verdict=(*done, words), good=True, runs=(path,), result=run), found
     )
 
 
-def _damage_of(result: Path) -> str:
-    """Say what is wrong with a calibration, or a JSON file of results; empty where it can be read."""
-    try:
-        if result.is_dir():
-            load_calibration(result)
-        else:
-            parse_json(read_bytes(result))
-    except ValueError as error:
-        return f"{result}: {error}."
-    except (BenchError, OSError) as error:
-        return str(error)
-    return ""
+def _with_damage(outcome: Outcome, found: Verification) -> Outcome:
+    """Say with what became of a run's frames which results, made of them before, are damaged."""
+    if not found.results:
+        return outcome
+    words = "What was made of the frames is damaged: " + " ".join(map(str, found.results))
+    return replace(outcome, verdict=(*outcome.verdict, words), good=False)
 
 
 def _refuse_nested(run: Path) -> None:

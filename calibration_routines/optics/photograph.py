@@ -30,13 +30,12 @@ from instrument.files.images import write_image
 from instrument.files.record import RecordFormat, plain
 from instrument.plan import OFF, Part, Plan, check
 from instrument.runs.acquire import abilities_of, acquire
+from instrument.runs.results import PHOTOGRAPH_FILE
 from instrument.runs.run import Run
 from instrument.runs.run_control import RunControl
 from recon.base.arguments import require_argument
 from recon.base.blocks import block_mean
 from recon.base.declare import RARE, option
-
-PHOTOGRAPH_FILE = "photograph.tif"
 
 
 @dataclass(frozen=True, slots=True)

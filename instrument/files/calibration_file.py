@@ -13,11 +13,12 @@ Source positions need not be evenly spaced, which OME-Zarr cannot say: they stan
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import math
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
@@ -31,6 +32,9 @@ from instrument.files.record import RecordFormat
 from recon.base.arguments import require_argument
 from recon.base.checks import require_calibration
 from recon.types import Calibration, Geometry
+
+if TYPE_CHECKING:
+    import zarr
 
 _JSON = "calibration.json"
 _PSFS = "psfs.ome.zarr"
@@ -121,6 +125,24 @@ def load_calibration(folder: Path | str) -> Calibration:
             quality=record["quality"],
             provenance=record["provenance"],
         )
+
+
+def check_calibration(folder: Path | str, *, read: bool = True) -> None:
+    """Raise what :func:`load_calibration` would raise, holding no more than one PSF at a time.
+
+    ``read``: False looks at the record only, and whether its arrays are there.
+    """
+    path = Path(folder)
+    if not (path / _JSON).is_file():
+        raise CalibrationFileError(path, f"is no calibration: it holds no {_JSON}.")
+    record = CALIBRATION.read(path / _JSON)
+    with CALIBRATION.damaged(path / _JSON):
+        CALIBRATION.value(Geometry, record["geometry"], path / _JSON)
+        for name, checksum in record["sha256"].items():
+            if not (path / name / "0").is_dir():
+                raise CalibrationFileError(path / name, "is missing.", _RESTORE)
+            if read:
+                _check_array(path, name, checksum)
 
 
 def is_calibration(folder: Path | str) -> bool:
@@ -218,26 +240,50 @@ def _write_ome_zarr(array: npt.NDArray[np.float32], path: Path, axes: str, pitch
 
 
 def _read_array(folder: Path, name: str, checksums: Mapping[str, str]) -> npt.NDArray[np.float32]:
+    with _reading(folder / name):
+        array = np.ascontiguousarray(_stored(folder / name)[...])
+    _require_checksum(folder / name, _sha256(array), checksums[name])
+    return array.astype(np.float32, copy=False)
+
+
+def _check_array(folder: Path, name: str, checksum: str) -> None:
+    digest = hashlib.sha256()
+    with _reading(folder / name):
+        stored = _stored(folder / name)
+        for number in range(stored.shape[0]):
+            digest.update(np.ascontiguousarray(stored[number]).data)
+    _require_checksum(folder / name, digest.hexdigest(), checksum)
+
+
+def _stored(array: Path) -> zarr.Array[Any]:
+    """Open an array on the disk; FileError where it says to be far larger than its files can hold."""
     import zarr
 
+    stored = zarr.open_array(array / "0", mode="r")
+    held = folder_bytes(array, stored.nbytes, [(array, piece_bytes(stored))])
+    require_plausible(array, stored.nbytes, held)
+    return stored
+
+
+@contextlib.contextmanager
+def _reading(array: Path) -> Iterator[None]:
+    """Say of whatever reading an array raises that it is missing or damaged."""
     try:
-        stored = zarr.open_array(folder / name / "0", mode="r")
-        held = folder_bytes(folder / name, stored.nbytes, [(folder / name, piece_bytes(stored))])
-        require_plausible(folder / name, stored.nbytes, held)
-        array = np.ascontiguousarray(stored[...])
+        yield
     except FileError:
         raise
     except Exception as error:  # zarr's stores and codecs raise errors of many kinds for damaged files
+        words = f"cannot be read ({error}): it is missing or damaged."
+        raise CalibrationFileError(array, words, _RESTORE) from error
+
+
+def _require_checksum(array: Path, found: str, recorded: str) -> None:
+    if found != recorded:
         raise CalibrationFileError(
-            folder / name, f"cannot be read ({error}): it is missing or damaged.", _RESTORE
-        ) from error
-    if _sha256(array) != checksums[name]:
-        raise CalibrationFileError(
-            folder / name,
+            array,
             f"does not have the checksum recorded in {_JSON}: its data were changed or damaged.",
             _RESTORE,
         )
-    return array.astype(np.float32, copy=False)
 
 
 def _sha256(array: npt.NDArray[Any]) -> str:

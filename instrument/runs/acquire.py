@@ -182,7 +182,7 @@ def settle(path: Path | str, found: Verification | None = None) -> list[str]:
     if found.todo:
         raise RunError(Path(path), f"{len(found.todo)} frames of its plan are still to be taken.")
     ended = found.condition in (_ANY_END if found.is_recording else (RunCondition.COMPLETED,))
-    if found.is_sound and ended:
+    if found.is_as_written and ended:
         return []
     with RunWriter.reopen(path, log_bytes=found.log_bytes) as writer:
         words = [*writer.mended, *writer.settle({f.index: f.problem for f in found.damaged})]

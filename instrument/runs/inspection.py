@@ -16,8 +16,9 @@ from instrument.files.figures import save_figure
 from instrument.files.images import image_metadata
 from instrument.files.seen import as_seen
 from instrument.runs.repair import file_problems
+from instrument.runs.results import result_problems
 from instrument.runs.run import DamagedFrame, FinishReason, Run, RunCondition
-from instrument.runs.run_files import LOG, FileProblem, is_run
+from instrument.runs.run_files import LOG, FileProblem, is_run, note_damage, noted_damage
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,10 +42,17 @@ class Verification:
     """Small files that are not as they were written."""
     problems: tuple[str, ...]
     """Whatever else contradicts itself."""
+    results: tuple[FileProblem, ...] = ()
+    """Parts of what was made of the frames that cannot be read any more."""
 
     @property
     def is_sound(self) -> bool:
         """Whether nothing is wrong. A run that ended early is sound, only not complete."""
+        return self.is_as_written and not self.results
+
+    @property
+    def is_as_written(self) -> bool:
+        """Whether nothing is wrong with the run itself, whatever became of what was made of its frames."""
         return not (self.damaged or self.without_a_line or self.files or self.problems)
 
     @property
@@ -57,7 +65,7 @@ class Verification:
         found = [f"frame {frame.index}: {frame.problem}" for frame in self.damaged]
         if self.without_a_line:
             found.append(f"images without their line in the log: {frames_in_words(self.without_a_line)}")
-        return [*found, *map(str, self.files), *self.problems]
+        return [*found, *map(str, self.files), *self.problems, *map(str, self.results)]
 
     def remedy(self) -> str:
         """Return what ``resume`` would do, or what must be done before it can; empty where nothing is."""
@@ -88,10 +96,16 @@ class Verification:
 def verify(run: Run, on_progress: Progress | None = None, *, read: bool = True) -> Verification:
     """Read every frame of a run and hold it, its metadata, files and image array against the log.
 
-    ``on_progress`` is called with frames read and frames to read. ``read``: False looks at the images' sizes
-    only, which is quick, and reads again those that were damaged when the run was last read.
+    What was made of its frames is read, too, a calibration against its checksums. ``on_progress`` is called
+    with frames read and frames to read. ``read``: False looks at the images' sizes only, which is quick, and
+    reads again what was damaged when the run was last read. What reading finds is noted with the run.
     """
-    damaged = run.damaged(on_progress, read=read)
+    frames_noted, results_noted = (set(), set()) if read else noted_damage(run.path)
+    damaged = run.damaged(on_progress, read=read, noted=frames_noted)
+    results = tuple(result_problems(run.path, run.files.copies, read=read, noted=results_noted))
+    is_new = read or (frames_noted and not damaged) or (results_noted and not results)
+    if is_new and not run.is_being_written:
+        note_damage(run.path, [frame.index for frame in damaged], sorted({part.of for part in results}))
     again = {frame.index for frame in damaged}
     plan = run.plan
     steps = range(len(plan)) if plan is not None else ()
@@ -106,6 +120,7 @@ def verify(run: Run, on_progress: Progress | None = None, *, read: bool = True) 
         without_a_line=() if running else tuple(run.without_a_line()),
         files=tuple(file_problems(run)),
         problems=() if run.log_is_foreign else tuple(_contradictions(run)),
+        results=results,
     )
 
 
@@ -213,8 +228,8 @@ class RunSummary:
     is_simulated: bool = False
     problem: str = ""
     is_damaged: bool = False
-    """Whether a small file is not as it was written, or an image is gone, of another size, or was found
-    damaged when the run was last read and still is."""
+    """Whether a small file or a result is not as it was written, or an image is gone, of another size, or was
+    found damaged when the run was last read and still is."""
 
     @property
     def kind(self) -> str:

@@ -5,7 +5,7 @@ The folder's format is in docs/reference/run-folder.md.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from enum import StrEnum
 from functools import cached_property
@@ -36,8 +36,6 @@ from instrument.runs.run_files import (
     RunFiles,
     is_run,
     log_size,
-    note_damage,
-    noted_damage,
 )
 
 if TYPE_CHECKING:
@@ -411,15 +409,16 @@ class Run:
             return record.n_bytes, record.crc32
         return self.unlisted[index].n_bytes, int(self.unlisted[index].crc32, 16)
 
-    def damaged(self, on_progress: Progress | None = None, *, read: bool = True) -> tuple[DamagedFrame, ...]:
+    def damaged(
+        self, on_progress: Progress | None = None, *, read: bool = True, noted: Collection[int] = ()
+    ) -> tuple[DamagedFrame, ...]:
         """Return the frames that are not as they were written.
 
         ``on_progress`` is called with frames read and frames to read. ``read``: False only looks at the
-        files' sizes, and reads those that an earlier reading noted as damaged. What reading finds is noted.
+        files' sizes, and reads the ``noted`` ones, that an earlier reading found damaged.
         """
         checked = []
         listed = sorted({*self.records, *self.unlisted})
-        noted = set() if read else noted_damage(self.path)
         for count, index in enumerate(listed, start=1):
             unread = not read and index not in noted and self.has_frames
             if unread and self.array.n_bytes(index) == self._written(index)[0]:
@@ -427,10 +426,7 @@ class Run:
             checked.append(self.verify(index))
             if on_progress is not None:
                 on_progress(count, len(listed))
-        found = tuple(frame for frame in checked if frame is not None)
-        if (read or (noted and not found)) and not self.is_being_written:
-            note_damage(self.path, [frame.index for frame in found])
-        return found
+        return tuple(frame for frame in checked if frame is not None)
 
     def without_a_line(self) -> list[int]:
         """Return the images on the disk that no line of the log is about, in order."""

@@ -36,7 +36,7 @@ RUN_STATE = RecordFormat("diffuserbench run", "run's state", error=RunError, num
 """``state.json``; its version is that of the whole folder."""
 
 NOTED = RecordFormat("diffuserbench damaged frames", "note of damaged frames", error=RunError)
-"""``damaged.json``: the frames that reading a run found damaged, for who looks at sizes only."""
+"""``damaged.json``: what reading a run found damaged, for who looks at sizes only."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,6 +49,8 @@ class FileProblem:
     """What it should hold; None where that is not known."""
     remedy: str = ""
     """What ``resume`` does about it; empty where it can do nothing."""
+    of: str = ""
+    """The result that it is part of, as it is named in the run's folder; empty for the run's own files."""
 
     def __str__(self) -> str:
         return f"{self.name}: {self.problem}"
@@ -173,19 +175,20 @@ def log_size(path: Path | str) -> int:
         return 0
 
 
-def noted_damage(folder: Path) -> set[int]:
-    """Return the frames that were damaged when a run was last read: to be read again."""
+def noted_damage(folder: Path) -> tuple[set[int], set[str]]:
+    """Return the frames, and the results, that were damaged when a run was last read: to be read again."""
     try:
-        return set(NOTED.read(folder / DAMAGED)["frames"])
+        noted = NOTED.read(folder / DAMAGED)
+        return set(noted["frames"]), set(noted.get("results", ()))
     except (OSError, FileError, LookupError, TypeError):
-        return set()
+        return set(), set()
 
 
-def note_damage(folder: Path, frames: Sequence[int]) -> None:
-    """Note, where one may write there, which frames of a run are damaged; without any there is no note."""
+def note_damage(folder: Path, frames: Sequence[int], results: Sequence[str] = ()) -> None:
+    """Note, where one may write there, what of a run is damaged; without anything there is no note."""
     with contextlib.suppress(OSError, FileError):
-        if frames:
-            NOTED.write(folder / DAMAGED, {"frames": frames})
+        if frames or results:
+            NOTED.write(folder / DAMAGED, {"frames": frames, "results": results})
         else:
             (folder / DAMAGED).unlink(missing_ok=True)
 

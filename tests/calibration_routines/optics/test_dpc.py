@@ -88,7 +88,9 @@ def test_a_run_that_was_cut_off_is_resumed_to_its_surface(
     (run / "dpc.json").write_bytes((tmp_path / "before.json").read_bytes()[:99])
     assert main(["resume", str(run)]) == 1
     said = " ".join(capsys.readouterr().out.split())
-    assert f"But what was made of them is damaged: {run / 'dpc.json'}: " in said
+    assert "What was made of the frames is damaged: dpc.json: is damaged: " in said
+    assert main(["verify", str(run)]) == 1
+    assert "dpc.json: is damaged: " in " ".join(capsys.readouterr().err.split())
     (run / "dpc.json").unlink()
     assert main(["resume", str(run)]) == 0
     assert "Height" in capsys.readouterr().out

@@ -17,7 +17,9 @@ import numpy as np
 import pytest
 
 from instrument.cli import main
+from instrument.files.calibration_file import save_calibration
 from instrument.files.errors import FileError
+from instrument.files.images import write_image
 from instrument.plan import Part, Plan
 from instrument.runs import writer
 from instrument.runs.acquire import look, prepare, prepare_resume, settle
@@ -26,6 +28,7 @@ from instrument.runs.log import AppendOnlyLog
 from instrument.runs.run import FinishReason, Run, RunCondition
 from instrument.runs.run_files import UNCHANGING, RunError
 from instrument.runs.writer import FrameToStore, RunWriter, lock_run
+from recon.types import Calibration
 from tests.instrument.runs.test_resume import open_mock_bench
 from tests.instrument.runs.test_store import BENCH, frame, new_run
 
@@ -236,6 +239,93 @@ def test_no_two_commands_contradict_each_other_about_a_changed_pixel(
     chunk.write_bytes(whole)
     assert said("verify")[0] == 0
     assert not (path / "damaged.json").exists()
+
+
+_PSFS = "calibration/psfs.ome.zarr"
+CALIBRATION = {
+    "calibration/calibration.json": DAMAGES,
+    f"{_PSFS}/0/zarr.json": (deleted, truncated, zeroed, newer),
+    f"{_PSFS}/0/c/0/0/0/0": (deleted, truncated, one_bit, zeroed, anothers),
+}
+
+
+@pytest.fixture(scope="module")
+def calibrated(runs: tuple[Path, Path], tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
+    """Copies of the runs, with a calibration in each."""
+    paths = []
+    for number, run in enumerate(runs):
+        path = tmp_path_factory.mktemp("calibrated") / "run"
+        shutil.copytree(run, path)
+        psfs = np.random.default_rng(number).random((2, 1, 8, 9)).astype(np.float32)
+        made = Calibration(psfs, np.array([[0.0, 0.0, 1e4], [0.0, 0.0, 2e4 + number]]))
+        save_calibration(made, path / "calibration")
+        paths.append(path)
+    return paths[0], paths[1]
+
+
+@pytest.mark.parametrize(
+    ("name", "damage"),
+    [
+        (name, damage)
+        for name, damages in CALIBRATION.items()
+        for damage in damages
+        if (name, damage) != ("calibration/calibration.json", older)  # nothing in it is of an earlier state
+    ],
+    ids=lambda value: value if isinstance(value, str) else value.__name__,
+)
+def test_no_two_commands_contradict_each_other_about_a_damaged_calibration(
+    tmp_path: Path,
+    calibrated: tuple[Path, Path],
+    capsys: pytest.CaptureFixture[str],
+    name: str,
+    damage: Callable[[Path, Path], None],
+) -> None:
+    path = tmp_path / "runs" / "run"
+    shutil.copytree(calibrated[0], path)
+    whole = (path / name).read_bytes()
+    damage(path / name, calibrated[1] / name)
+
+    def said(*words: str) -> tuple[int, str]:
+        status = main([*words, str(path.parent if words == ("list",) else path)])
+        return status, " ".join("".join(capsys.readouterr()).split())
+
+    (words,) = look(path).lines()
+    assert words.startswith("calibration")
+    words = " ".join(words.split())
+    status, verified = said("verify")
+    assert status == 1
+    assert words in verified
+    assert "DAMAGED, completed, 3 of 3 frames read back" in verified
+    assert f"DAMAGED: {words}" in said("show")[1]
+    for _ in range(2):
+        assert said("resume")[0] == 1
+        status, resumed = said("resume")
+        assert "complete already, 3 frames read back, all as they were written." in resumed
+        assert f"What was made of the frames is damaged: {words}" in resumed
+    assert "DAMAGED" in said("list")[1]
+    window = pytest.importorskip("gui.run_looks")
+    for read in (False, True):
+        about = [" ".join(line.split()) for line in window.look_into(path, read=read).about]
+        assert f"DAMAGED: {words}" in about
+    (path / name).write_bytes(whole)  # from a backup
+    assert "DAMAGED" not in said("list")[1]
+    assert not (path / "damaged.json").exists()
+    assert said("verify")[0] == said("resume")[0] == 0
+
+
+def test_a_photograph_made_of_a_run_is_read_as_a_picture(
+    tmp_path: Path, runs: tuple[Path, Path], capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / "run"
+    shutil.copytree(runs[0], path)
+    write_image(path / "photograph.tif", np.arange(20, dtype=np.float32).reshape(4, 5))
+    (path / "photograph_run.json").write_text("{}")
+    assert main(["resume", str(path)]) == main(["verify", str(path)]) == 0
+    assert "damaged" not in capsys.readouterr().out
+    truncated(path / "photograph.tif", path)
+    assert main(["resume", str(path)]) == main(["verify", str(path)]) == 1
+    said = "".join(capsys.readouterr())
+    assert "What was made of the frames is damaged: photograph.tif: " in said
 
 
 def test_a_bad_byte_in_a_log_costs_its_line_at_most(tmp_path: Path) -> None:

@@ -259,9 +259,11 @@ def test_what_a_file_held_comes_from_its_copy_or_from_itself(tmp_path: Path) -> 
 
 
 def test_damage_is_noted_and_the_note_goes_with_it(tmp_path: Path) -> None:
-    assert noted_damage(tmp_path) == set()
+    assert noted_damage(tmp_path) == (set(), set())
     note_damage(tmp_path, [3, 5])
-    assert noted_damage(tmp_path) == {3, 5}
+    assert noted_damage(tmp_path) == ({3, 5}, set())
+    note_damage(tmp_path, [], ["calibration"])
+    assert noted_damage(tmp_path) == (set(), {"calibration"})
     note_damage(tmp_path, [])
     assert not list(tmp_path.iterdir())
     note_damage(tmp_path, [])
@@ -364,4 +366,4 @@ def test_who_looks_at_sizes_only_reads_nothing_that_is_whole(
     assert [frame.index for frame in verify(Run.open(path), read=False).damaged] == [1]
     chunk.write_bytes(data)
     assert verify(Run.open(path), read=False).is_sound
-    assert noted_damage(path) == set()
+    assert noted_damage(path) == (set(), set())
