@@ -301,17 +301,16 @@ def reconstruct_job(work: ReconstructionWork, context: JobContext) -> Written:
     prepared = request.prepare()
     n_planes = len(prepared.calibration.psfs) if isinstance(request, VolumeRequest) else 1
     outputs.check(n_planes * prepared.measurement.size)
-    keeper = checkpoint_for(work.kept_in, prepared, request)
-    context.report(SoFar(0.0, "Solving …", prepared))
-    history: list[IterationRecord] = []
-    share, note = 0.0, ""
-
     expected = ""
 
     def told(words: str) -> None:
         nonlocal expected
-        expected = f"; {words}"
+        expected += f"; {words}"
 
+    keeper = checkpoint_for(work.kept_in, prepared, request, say=told)
+    context.report(SoFar(0.0, "Solving …", prepared))
+    history: list[IterationRecord] = []
+    share, note = 0.0, ""
     foretold = Foretold(told, Like.of(prepared, request.options))
 
     def watch(record: IterationRecord, present: Callable[[], npt.NDArray[np.float32]]) -> None:

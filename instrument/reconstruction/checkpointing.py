@@ -10,7 +10,7 @@ import contextlib
 import hashlib
 import time
 import zipfile
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import astuple, fields
 from importlib.metadata import version
 from pathlib import Path
@@ -27,7 +27,7 @@ from instrument.files.atomic import (
     whole_file,
     write_json,
 )
-from instrument.files.errors import BenchError, FileError
+from instrument.files.errors import BenchError, FileError, os_reason
 from instrument.files.reading import parse_json, read_bytes
 from instrument.files.record import plain
 from instrument.reconstruction.job import Job
@@ -73,11 +73,13 @@ def checkpoint_for(
     job: Job,
     request: PictureRequest | VolumeRequest | PatternedRequest,
     patterned: Measurement | None = None,
+    *,
+    say: Callable[[str], None] = lambda _: None,
 ) -> CheckpointFolder | None:
     """Return the folder that was asked for, checked against what is to be reconstructed.
 
     ``patterned``: all frames under their patterns, of which the job has the sum. What only says when to stop
-    may differ from the earlier run.
+    may differ from the earlier run. ``say`` is told once, at once, that nothing can be kept any more.
 
     Raises BenchError as :func:`require_kept`; FileError when the folder keeps something else.
     """
@@ -101,7 +103,7 @@ def checkpoint_for(
             "valid pixels": digest(None if patterned.erasures is None else np.asarray(patterned.erasures)),
             "patterns": digest(np.asarray(patterned.patterns)),
         }
-    return CheckpointFolder(folder, problem)
+    return CheckpointFolder(folder, problem, say=say)
 
 
 def settle_checkpoint(
@@ -125,6 +127,8 @@ def settle_checkpoint(
         others = keeper.remove()
         stays = f"; {keeper.folder} stays, for what else it holds: {', '.join(others)}" if others else ""
         told["Checkpoint"] = f"removed: the work has come to its end{stays}"
+    elif keeper.failed:
+        told["Checkpoint"] = keeper.failed
     else:
         told["Checkpoint"] = f"{keeper.folder}: the same again, with more time, goes on from it"
     return told
@@ -151,16 +155,28 @@ class CheckpointFolder:
         What decides the result, JSON-compatible: a folder kept for something else is refused.
     every_s : float
         Least time between two writings of a part.
+    say : callable, optional
+        Told why nothing can be kept any more, once; the work goes on.
 
     Attributes
     ----------
+    failed : str
+        Why nothing was kept when it was last tried; empty where it was.
     left_aside : tuple of str
         Files of work that is not gone on with: of an older version, or of another choice of ``auto``.
     """
 
-    def __init__(self, folder: Path, problem: Mapping[str, Any], *, every_s: float = EVERY_S) -> None:
+    def __init__(
+        self,
+        folder: Path,
+        problem: Mapping[str, Any],
+        *,
+        every_s: float = EVERY_S,
+        say: Callable[[str], None] = lambda _: None,
+    ) -> None:
         self.folder = folder
-        self._every_s = every_s
+        self.failed = ""
+        self._every_s, self._say, self._is_said = every_s, say, False
         self._written = time.monotonic()
         self._resumed: dict[str, int] = {}
         self._kept = False
@@ -211,7 +227,10 @@ class CheckpointFolder:
         return records
 
     def keep(self, part: str, solver: Solver, history: Sequence[IterationRecord], *, ended: bool) -> None:
-        """Write a solver's state when it is time to, or its run has ended."""
+        """Write a solver's state when it is time to, or its run has ended.
+
+        Where that fails the work goes on: a result is not lost because it cannot be kept on its way.
+        """
         if not ended and time.monotonic() - self._written < self._every_s:
             return
         if not history:
@@ -220,9 +239,23 @@ class CheckpointFolder:
             f"{_STATE}{name}": value for name, value in _flat(solver.checkpoint(copy=False)).items()
         }
         state[_HISTORY] = np.array([astuple(record) for record in history])
-        with whole_file(self._path(part)) as temporary:
-            np.savez(temporary, **state)
-        self._written, self._kept = time.monotonic(), True
+        self._written = time.monotonic()
+        try:
+            if not (self.folder / PROBLEM).is_file():  # states alone would be taken for any problem's
+                raise FileError(self.folder, "was deleted or moved meanwhile.")
+            with whole_file(self._path(part)) as temporary:
+                np.savez(temporary, **state)
+        except (OSError, FileError) as error:
+            self._cannot_keep(error)
+        else:
+            self._kept, self.failed = True, ""
+
+    def _cannot_keep(self, error: OSError | FileError) -> None:
+        reason = str(error) if isinstance(error, FileError) else f"{self.folder}: {os_reason(error)}"
+        self.failed = f"not kept: {reason}"
+        if not self._is_said:
+            self._is_said = True
+            self._say(f"Warning: {reason} The work goes on; what it has done is not kept for another time.")
 
     def remove(self) -> tuple[str, ...]:
         """Delete what was kept, as there is nothing left to go on with; return what else the folder holds.

@@ -64,7 +64,7 @@ def reconstruct_photograph(
         _tell_job(
             desk, job, f"{'PSFs' if is_volume else 'PSF'} or image come from the simulated bench{turned}"
         )
-        keeper = checkpoint_for(output.checkpoint, job, request)
+        keeper = checkpoint_for(output.checkpoint, job, request, say=desk.warn)
         what = "volume" if is_volume else "picture"
         with desk.interruptible() as cancel, desk.step(what, 100) as advance:
             like = Like.of(job, request.options)
@@ -149,7 +149,7 @@ def reconstruct_patterns(
         job = prepared.job
         outputs.check(job.measurement.size, overwrite=output.force)
         _tell_job(desk, job, f"calibration or frames come from the simulated bench{_turned(desk, output)}")
-        keeper = checkpoint_for(output.checkpoint, job, request, prepared.measurement)
+        keeper = checkpoint_for(output.checkpoint, job, request, prepared.measurement, say=desk.warn)
         with (
             desk.interruptible() as cancel,
             desk.step("picture", request.options.iterations or ITERATIONS) as advance,

@@ -1,6 +1,8 @@
 """Reconstructions that are kept in a folder and gone on with."""
 
+import errno
 import json
+import shutil
 
 import numpy as np
 import pytest
@@ -239,6 +241,42 @@ def test_a_checkpoint_that_somebody_has_deleted_is_removed(tmp_path):
     (tmp_path / "kept" / "problem.json").unlink()
     (tmp_path / "kept").rmdir()
     assert keeper.remove() == ()
+
+
+@pytest.mark.parametrize("lost", ["deleted", "moved", "full"])
+def test_a_checkpoint_that_cannot_be_kept_on_costs_no_result(files, run, monkeypatch, lost):
+    """What the folder's loss would take is the picture itself; that it is lost is said once."""
+    kept, out, whole = files / "kept", files / "a.tif", files / "b.tif"
+    keep, calls = CheckpointFolder.keep, []
+
+    def keeping(*given, **named):
+        calls.append(given)
+        if len(calls) == 3:
+            if lost == "deleted":
+                shutil.rmtree(kept)
+            elif lost == "moved":
+                kept.rename(files / "elsewhere")
+            else:
+                monkeypatch.setattr(np, "savez", no_space)
+        keep(*given, **named)
+
+    def no_space(*_, **__):
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    what = ("--psf", files / "psf.tif", "-n", 8)
+    assert run(*what, "-o", whole)[0] == 0
+    monkeypatch.setattr(CheckpointFolder, "keep", keeping)
+    monkeypatch.setitem(CheckpointFolder.__init__.__kwdefaults__, "every_s", 0.0)
+    code, said = run(*what, "--checkpoint", kept, "-o", out)
+    assert code == 0, said
+    assert len(calls) > 3
+    assert said.count("The work goes on; what it has done is not kept for another time.") == 1
+    reason = "no space left" if lost == "full" else "was deleted or moved meanwhile"
+    assert said.count(reason) == 2, "at once, and in the end"
+    assert "goes on from it" not in said
+    expected = tifffile.imread(whole)
+    assert tifffile.imread(out) == pytest.approx(expected, abs=1e-5 * float(expected.max()))
+    assert kept.exists() == (lost == "full")
 
 
 def test_only_what_was_kept_is_removed(files, run):
