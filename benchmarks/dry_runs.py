@@ -6,9 +6,9 @@
 Each on the preset ``tiny`` in real time, told and then taken in two processes, in a folder of its own without
 what other runs took, and without kernels that others compiled (``--compiled``: with those that are there).
 The time that the program takes to start is in neither: taken is what goes by from its first words on. The
-screen is that of ``diffuserbench new --screen``, by default and smaller and larger. ``--processor`` is for a
-busy machine: it tells and takes the screen by default in processor seconds of one thread, the rehearsal ended
-after so many.
+screen, the LED microscope and the SLM are those of ``diffuserbench new``, the display that is learned that of
+``benchmarks/display_learning.py``. ``--processor`` is for a busy machine: it tells and takes the screen by
+default in processor seconds of one thread, the rehearsal ended after so many.
 """
 
 from __future__ import annotations
@@ -23,6 +23,7 @@ import time
 from pathlib import Path
 from types import SimpleNamespace
 
+from benchmarks.display_learning import configuration
 from calibration_routines import rehearsal
 from calibration_routines.routine import routines
 from instrument.bench.bench import open_bench
@@ -41,20 +42,32 @@ preset = "tiny"
 """
 BEADS = 'scene = "beads"\nbeads = 20\n'
 ROUTINES = {
+    "photograph": ("",),
     "axial": ("--z-min 60 --z-max 150 --planes 6",),
+    "lateral": ("--z 80",),
+    "volume": ("--z-min 60 --z-max 150 --planes 3 --spacing 8 --half-field-x 8 --half-field-y 8",),
     "angular": ("",),
     "stage": ("",),
     "beads": ("--binning 4",),
     "screen": ("", "--binning 2 --pictures 8", "--pictures 30 --judged 5"),
+    "dpc": ("--na 0.1 --magnification 4",),
+    "slm": ("",),
+    "display": ("--patterns 5",),
 }
+BENCHES = {
+    "beads": BENCH + BEADS,
+    "screen": template("screen"),
+    "dpc": template("led_microscope"),
+    "slm": template("display"),
+    "display": configuration("errors", expansion=4, seed=0),
+}
+"""Of all others: :data:`BENCH`."""
 TYPED = "import sys; from instrument.cli import main; sys.exit(main(sys.argv[1:]))"
 
 
 def bench_of(routine: str) -> str:
-    """Return the bench that a routine is told and taken on."""
-    if routine == "screen":
-        return template("screen").replace("time_scale = 0.0", "time_scale = 1.0")
-    return BENCH + (BEADS if routine == "beads" else "")
+    """Return the bench that a routine is told and taken on, in real time."""
+    return BENCHES.get(routine, BENCH).replace("time_scale = 0.0", "time_scale = 1.0")
 
 
 def carried_out(routine: str, words: list[str], folder: Path, *, compiled: bool) -> tuple[float, str]:
