@@ -88,11 +88,13 @@ class DarkModel:
         longest = int(np.argmax(self._exposures_ms))
         stack = frames[longest]
         first = early[longest] if early else len(stack)
-        self.hot = hot_pixels(np.max(stack[:first], axis=0), full_scale)
+        before = np.max(stack[:first], axis=0)
+        self.hot = hot_pixels(before, full_scale)
         """Pixels that are bright without light at the longer exposure, in any frame: some blink, some turn
         hot meanwhile."""
         self.late_hot = 0
-        """Pixels among them that were not so in the first dark frames."""
+        """Pixels among them that were not half as bright in the first dark frames: warm ones, which noise
+        takes beyond what is hot now and then, did not turn."""
         self.variance = float("nan")
         """Of a pixel from frame to frame in the dark, counts squared; nan of a single frame."""
         if len(some := stack[:first, :: max(1, stack[0].size // _NOISE_PX)]) > 1:
@@ -101,8 +103,9 @@ class DarkModel:
         self.brightening_per_ms = 0.0
         """Counts a millisecond by which the last dark frames are brighter than the first, in the median."""
         if first < len(stack):
-            late = hot_pixels(np.max(stack[first:], axis=0), full_scale) & ~self.hot
-            self.late_hot, self.hot = int(np.count_nonzero(late)), self.hot | late
+            late = hot_pixels(np.max(stack[first:], axis=0), full_scale)
+            self.late_hot = int(np.count_nonzero(late & ~hot_pixels(before, full_scale, 0.5)))
+            self.hot |= late
             more = float(np.median(_mean(stack[first:]) - _mean(stack[:first])))
             self.brightening_per_ms = more / self._exposures_ms[longest]
 

@@ -43,6 +43,20 @@ def plane(z_um: float, exposure_ms: float, n: int = 4) -> PlaneFrames:
     return PlaneFrames((0.0, 0.0, z_um), exposure_ms, frames(light_at(z_um), exposure_ms, n), FULL)
 
 
+def test_pixels_as_warm_as_hot_ones_have_not_turned_hot() -> None:
+    random, full_scale = np.random.default_rng(5), 65535
+    expected = np.full((300, 400), 500.0)
+    warm, turned = expected.reshape(-1)[:2000], (slice(150, 160), slice(0, 30))
+    warm += 0.01 * full_scale  # by what makes a pixel hot: noise tells, from frame to frame
+    early = random.normal(expected, 30.0, (4, *expected.shape))
+    expected[turned] += 0.1 * full_scale
+    late = random.normal(expected, 30.0, (4, *expected.shape))
+    dark = DarkModel((100.0,), (np.concatenate([early, late]).astype(np.uint16),), full_scale, (4,))
+    assert dark.late_hot == 300
+    assert dark.hot[turned].all()
+    assert dark.hot.reshape(-1)[:2000].mean() > 0.5
+
+
 def test_psfs_are_the_light_alone_in_counts_of_one_exposure() -> None:
     depths = [(100e3, 60.0), (140e3, 120.0), (200e3, 200.0)]
     result = analyse_sweep([plane(z, e) for z, e in depths], dark_model(), GEOMETRY)
