@@ -91,6 +91,8 @@ class Work:
     def __init__(self, kind: Kind, parent: Path, number: int, *, clock_jumps: bool) -> None:
         self.kind, self._parent, self._number = kind, parent, number
         self._clock_jumps = clock_jumps
+        self.lives_s = 0.0
+        """How long a process lives that nobody kills; the first one reads what is cached since."""
         self.given = parent / "given"
         self.given.mkdir()
         (self.given / "bench.toml").write_text(BENCH + '[slm]\ndriver = "simulated"\nshape = [96, 128]\n')
@@ -178,8 +180,10 @@ class Work:
         promised: dict[int, int] = {}
         kept: dict[int, bytes] = {}
         when = choose()
+        attempts = 0
         while True:
             done = self.attempt(folder, in_folder(command, folder), when, self._number)
+            attempts += 1
             promised |= done.promised
             if done.killed:
                 tally.kills += 1
@@ -189,6 +193,8 @@ class Work:
                 tally.found("failed", 1, f"{command}: exit {done.code}: {done.said[-6000:]}")
                 break
             else:
+                if attempts == 1:
+                    self.lives_s = max(done.lived_s, 0.7 * self.lives_s)
                 break
             if not self.kind.makes_run or runs_in(folder / "runs"):
                 command = self.kind.again
@@ -288,6 +294,7 @@ def kill(name: str, kills: int, number: int, seconds: float, *, clock_jumps: boo
         shutil.copytree(job.given, whole)
         command = in_folder(kind.first if kind.cut_after is None else kind.again, whole)
         done = job.whole(whole, command)
+        job.lives_s = done.lived_s
         sums = list(done.promised.values())
         if len(sums) != len(set(sums)):
             raise SystemExit(f"{name}: frames are alike; a swap would not be seen.")
@@ -297,9 +304,9 @@ def kill(name: str, kills: int, number: int, seconds: float, *, clock_jumps: boo
             if tally.kills >= kills:
                 return None
             if kind.begins == "finishing":  # most of what is left after it is the program's own end
-                return 0, random.uniform(0.0, 0.4 * done.lived_s)
+                return 0, random.uniform(0.0, 0.4 * job.lives_s)
             if kind.begins == "start" or random.random() < 0.3:
-                return 0, random.uniform(0.0, 1.05 * done.lived_s)
+                return 0, random.uniform(0.0, 1.05 * job.lives_s)
             return random.randint(1, len(sums)), random.uniform(0.0, 0.03)
 
         fruitless, ends_s = 0, time.monotonic() + seconds
