@@ -216,8 +216,10 @@ class _Search:
         for z in range(nearest, farthest + 1):
             row, column = self._on_ray(voxel, z)
             reach = pixels * widest / self.angles[z] + 1e-6
-            _, top, left = self._cell(z, row - reach, column - reach)
-            _, bottom, right = self._cell(z, row + reach, column + reach)
+            # Pixels that look at very narrow angles are many; the points lie on their plane.
+            height, width = self.grid.shape[1:]
+            _, top, left = self._cell(z, max(row - reach, 0), max(column - reach, 0))
+            _, bottom, right = self._cell(z, min(row + reach, height - 1), min(column + reach, width - 1))
             for down in range(top, bottom + 1):
                 for across in range(left, right + 1):
                     yield from self.found.get((z, down, across), ())

@@ -193,3 +193,23 @@ def test_what_is_no_volume_of_points_is_refused(monkeypatch: pytest.MonkeyPatch)
     monkeypatch.setattr(module, "MOST", 3)
     with pytest.raises(InputError, match="more than 3 points as bright"):
         point_places(lit(grid, random_points()), grid)
+
+
+def test_planes_of_very_different_depths_are_searched_no_farther_than_their_edges() -> None:
+    """A pixel of the near plane looks at as wide an angle as 20000 of the far one (a damaged record's)."""
+    grid = grid_of(np.array([1e5, 5.0]))
+    volume = np.random.default_rng(2).random(grid.shape).astype(np.float32)
+    search = module._Search(volume.__getitem__, grid, lambda _share: None)
+    search.angles = np.array([1.0, 2e4])
+    looked: list[object] = []
+
+    class Watched(dict):  # type: ignore[type-arg]
+        def get(self, key, default=None):  # type: ignore[no-untyped-def]
+            looked.append(key)
+            return super().get(key, default)
+
+    search.found = Watched()
+    found = search.brightest(0.9)
+    cells = 2 * (SHAPE[0] // module.CELL + 1) * (SHAPE[1] // module.CELL + 1)
+    assert found
+    assert len(looked) <= cells * np.count_nonzero(volume >= 0.9 * volume.max())
