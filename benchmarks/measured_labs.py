@@ -14,7 +14,12 @@ from benchmarks.measured_variants import BINNING, FULL, alike, columns, compress
 from recon import reconstruct
 from recon.base.blocks import block_mean
 from recon.evaluation.measured_sets import measured_set
+from recon.reconstruction.problem import Problem
+from recon.reconstruction.reconstruct import judged, lacking
 from recon.reconstruction.result import window_of
+from recon.reconstruction.selection import choose
+from recon.reconstruction.solve import solve
+from recon.verdict.missing_light import MUCH, MUCH_INSIDE
 
 Array = npt.NDArray[Any]
 
@@ -115,39 +120,39 @@ def labs(_: Path) -> list[str]:
 
 PLACES = ((0, 0), (1, 1), (0, 1), (1, 0), (0.5, 0), (0, 0.5), (0.5, 1), (1, 0.5))
 """Of windows beside the middle: corners and sides."""
-EDGE = 0.04
-"""Width of a PSF's edge, relative to its shorter side."""
 
 
 def cut(_: Path) -> list[str]:
-    """Show what tells a PSF that was cut with its photograph: light at its edges, and beyond the field."""
+    """Show what tells a PSF that was cut with its photograph: light that it lacks for what was found."""
     psfs, photograph = measured_set("hand")
     psf, seen = block_mean(psfs[0], BINNING), block_mean(photograph, BINNING)
     truth = reconstruct(seen, psf, solver="admm-sensor", iterations=400, tolerance=1e-5, judged=False).image
     central = [(share, 0.5, 0.5) for share in (1, 0.85, 0.7, 0.6, 0.5, 0.4)]
     beside = [(share, *place) for share in (0.7, 0.5) for place in PLACES]
     lines = [
-        f"Both cut, bin {BINNING}; edge: light of the PSF's outer {EDGE:.0%}, relative to its mean; beyond: "
-        "share of the light that was found beyond the sensor's field.",
+        f"Both cut, bin {BINNING}; beyond: share of the light that was found beyond the sensor's field; "
+        "lacks: light that the PSF lacks of what was found, relative to what it explains, and of what lies "
+        f"within the field. From {MUCH} and {MUCH_INSIDE} a picture is doubtful "
+        "([0311](../decisions/0311-light-that-a-cut-psf-lacks.md)).",
         "",
-        "| window's sides, down, across | dB | correlation | edge | beyond | verdict |",
-        "|---|---|---|---|---|---|",
+        "| window's sides, down, across | dB | correlation | beyond | lacks | within | verdict |",
+        "|---|---|---|---|---|---|---|",
     ]
     for share, down, across in (*central, *beside):
         one, data, picture = (window(a, share, down, across) for a in (psf, seen, truth))
-        result = reconstruct(data, one)
+        problem = choose(Problem.of(data, one))
+        result = judged(solve(problem), problem)
         decibels, correlation = alike(result.image, picture)
         assert result.state is not None
         assert result.verdict is not None
+        lacks = lacking(result, problem)
+        assert lacks is not None
         (rows, columns), _ = window_of("sensor", data.shape, one.shape)
         lit = np.maximum(result.state, 0)
         beyond = 1 - lit[..., rows, columns].sum() / lit.sum()
-        wide = round(EDGE * min(one.shape))
-        inner = one[wide:-wide, wide:-wide]
-        edge = (one.sum() - inner.sum()) / (one.size - inner.size) / one.mean()
         lines.append(
-            f"| {share:g}, {down:g}, {across:g} | {decibels:.1f} | {correlation:.3f} | {edge:.2f} | "
-            f"{beyond:.2f} | {result.verdict.sentences[0].split(':')[0]} |"
+            f"| {share:g}, {down:g}, {across:g} | {decibels:.1f} | {correlation:.3f} | {beyond:.2f} | "
+            f"{lacks.of_all:.2f} | {lacks.inside:.2f} | {result.verdict.sentences[0].split(':')[0]} |"
         )
         print(lines[-1], flush=True)
     return lines

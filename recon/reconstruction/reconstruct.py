@@ -25,7 +25,7 @@ from recon.reconstruction.part import Part, parts_of
 from recon.reconstruction.pilot import HELD_OUT
 from recon.reconstruction.problem import Problem, Stage
 from recon.reconstruction.psf_refinement import refined
-from recon.reconstruction.result import Reconstruction
+from recon.reconstruction.result import Reconstruction, window_of
 from recon.reconstruction.selection import choose
 from recon.reconstruction.solve import Progress, rules_of, solve
 from recon.reconstruction.solvers import SOLVERS
@@ -34,6 +34,7 @@ from recon.solvers.base import IterationRecord, Keeper
 from recon.types import Calibration
 from recon.verdict.evidence import evidence_of, not_judged, observations, unsettled_by
 from recon.verdict.judge import Verdict, method_name, unlike_any, verdict_on
+from recon.verdict.missing_light import Missing, missing_light
 
 FACTS = tuple(f.name for f in fields(Measurement) if f.name not in ("image", "found"))
 """What is known of a measurement, by the names that :func:`reconstruct` takes them by."""
@@ -200,6 +201,25 @@ def held_out_error(
     return float(np.sqrt(np.mean(missed**2)))
 
 
+def lacking(result: Reconstruction, problem: Problem) -> Missing | None:
+    """Return what a picture's PSF lacks, cut by the sensor's edges; None where that is not known.
+
+    So it is of several depths, of PSFs that vary over the field, and of a result without its whole object.
+
+    Parameters
+    ----------
+    result : Reconstruction
+    problem : Problem
+        That was solved.
+    """
+    if result.state is None or problem.n_planes > 1 or problem.patterned or problem.model != "convolution":
+        return None
+    psfs = problem.depths.central[0]
+    if psfs.shape[1:] != problem.sensor_shape:
+        return None  # it was cut to where it has light
+    return missing_light(psfs, result.state[:, 0], *window_of("sensor", problem.sensor_shape, psfs.shape[1:]))
+
+
 def judged(
     result: Reconstruction,
     problem: Problem,
@@ -210,6 +230,7 @@ def judged(
 ) -> Reconstruction:
     """Return the result with a verdict on whether to trust it and whether the calibration is its own.
 
+    Where the PSF goes on beyond the sensor and the scene needs what it lacks, the result is not reliable.
     At the cost of about two iterations, and of a hundred on few pixels; where no known case tells, of a third
     of the iterations more, for pixels that are held out.
 
@@ -233,6 +254,9 @@ def judged(
         try:
             check = check_calibration(problem, on_stage=tell)
             verdict = verdict if check is None else verdict.with_calibration(check)
+            missing = lacking(small, problem)
+            if missing is not None and missing.much:
+                verdict = verdict.with_cut_psf(missing.of_all / (1 + missing.of_all))
             if unlike_any(verdict):
                 missed = held_out_error(small, problem, on_stage=tell, cancel=cancel)
                 verdict = replace(verdict, held_out=missed)

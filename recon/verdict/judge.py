@@ -42,6 +42,12 @@ UNFINISHED = 10.0
 FIRST_ITERATIONS = "not reliable: the iterations were ended when the picture had hardly begun to settle"
 STILL_CHANGING = "doubtful: the iterations were ended while the picture still changed; similar ones are good"
 UNEXPLAINED = "doubtful: the model leaves {residual} unexplained, whatever similar cases say"
+CUT_PSF = (
+    "doubtful: the PSF goes on beyond the sensor's edges, and what was found lies so far from the middle "
+    "that up to {share:.0%} of its light comes from there, which the PSF does not hold. If the files were "
+    "cropped, give them whole; else a smaller scene in the middle would help, or a smaller pattern (a "
+    "farther scene, a diffuser nearer to the sensor)"
+)
 NO_CASES = "not judged: there are no known cases of {method}"
 NOISELESS = 1e3
 """``signal`` from which the data are no photograph's: a full well of 100,000 electrons gives some 300."""
@@ -197,6 +203,13 @@ class Verdict:
             decided = f"doubtful: {'. '.join(check.sentences)}"
             return replace(self, region=Region.NEAR, calibration=check, decided=decided)
         return replace(self, calibration=check)
+
+    def with_cut_psf(self, share: float) -> Verdict:
+        """Return the verdict with the share of the light that the PSF lacks, at most: it is not inside."""
+        if self.region is not Region.INSIDE:
+            return self
+        decided = CUT_PSF.format(share=share)
+        return replace(self, region=Region.NEAR, findings=(), decided=decided)
 
     def as_json(self) -> dict[str, Any]:
         """Return the verdict for a file."""
