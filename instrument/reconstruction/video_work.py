@@ -246,8 +246,7 @@ def on_cluster(
     """Solve blocks on a Dask cluster whose workers see the same files; raises as :func:`in_process`.
 
     A block whose worker is lost is solved by another; the loss is logged, and ``on_lost`` told how many were.
-    Raises BenchError where every
-    worker that took a block was lost.
+    Raises BenchError where every worker that took a block was lost, or other programs are installed there.
     """
     work = partial(solve_block, str(job), str(output), threads=1)
     # Not pure: a block is worked on again whatever the cluster has seen before.
@@ -274,6 +273,14 @@ def on_cluster(
                         "Every worker that took one of the blocks was lost, as when memory is short. Take "
                         "fewer workers or shorter blocks (--workers, --block); the same command goes on."
                     ) from None
+                except (ImportError, RuntimeError) as error:
+                    if not isinstance(error, ImportError) and "deserialization" not in str(error):
+                        raise
+                    reason = error if error.__cause__ is None else error.__cause__
+                    raise BenchError(
+                        f"The scheduler or a worker cannot read what it is given: {reason}. Start both with "
+                        "the Python that diffuserbench is installed in, of the same version as here."
+                    ) from error
             left -= finished
             if cancel.wait(_POLL_S):
                 raise CancelledError

@@ -176,6 +176,46 @@ def test_workers_that_are_lost_are_told(tmp_path: Path, caplog: pytest.LogCaptur
     ] * 2
 
 
+@pytest.mark.parametrize(
+    ("raised", "cause", "said"),
+    [
+        (RuntimeError("Error during deserialization of the task graph."), ImportError("No 'instrument'"), 1),
+        (ModuleNotFoundError("No 'instrument'"), None, 1),
+        (RuntimeError("a block's own"), None, 0),
+    ],
+)
+def test_a_scheduler_or_worker_without_this_program_is_said(
+    tmp_path: Path, raised: Exception, cause: Exception | None, said: int
+) -> None:
+    class Future:
+        def done(self) -> bool:
+            return True
+
+        def result(self) -> None:
+            raise raised from cause
+
+    class Client:
+        def submit(self, *_: object, **__: object) -> Future:
+            return Future()
+
+        def scheduler_info(self, n_workers: int) -> dict[str, dict[str, object]]:
+            return {"workers": {}}
+
+        def cancel(self, left: list[Future]) -> None:
+            assert left
+
+    expected, words = (
+        (BenchError, "cannot read what it is given: No 'instrument'. Start both")
+        if said
+        else (
+            RuntimeError,
+            "a block's own",
+        )
+    )
+    with pytest.raises(expected, match=words):
+        on_cluster(Client(), tmp_path, tmp_path, [0], lambda _: None, threading.Event())
+
+
 def test_a_scheduler_that_is_not_there_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("instrument.reconstruction.video_work.CONNECT_S", 1)
     with pytest.raises(BenchError, match="No Dask scheduler answers"), cluster(scheduler="tcp://127.0.0.1:9"):
