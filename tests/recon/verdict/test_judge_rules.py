@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from recon.verdict import judge
+from recon.verdict.calibration_check import CalibrationCheck, Fit
 from recon.verdict.chance import Chances, place_of, value_of
 from recon.verdict.coded import CODED, coded, straight
 from recon.verdict.evidence import DIVERGED, Evidence
@@ -175,6 +176,54 @@ def test_a_run_that_was_ended_too_early_is_told_so_first_and_once(unsettled: flo
 def test_what_is_unexplained_is_named_first_where_that_decided() -> None:
     verdict = judged(Told(0.1, load=0.1, unexplained=0.01), load=0.5, unexplained=0.2)
     assert [finding.stress for finding in verdict.findings] == ["unexplained", "load"]
+
+
+@pytest.mark.parametrize(
+    ("fit", "before", "after"),
+    [
+        (Fit.FITS, Region.INSIDE, Region.INSIDE),
+        (Fit.FITS, Region.OUTSIDE, Region.OUTSIDE),
+        (Fit.UNTOLD, Region.INSIDE, Region.NEAR),
+        (Fit.UNTOLD, Region.NEAR, Region.NEAR),
+        (Fit.UNTOLD, Region.UNKNOWN, Region.UNKNOWN),
+        (Fit.FOREIGN, Region.INSIDE, Region.OUTSIDE),
+        (Fit.FOREIGN, Region.UNKNOWN, Region.OUTSIDE),
+    ],
+)
+def test_with_a_calibration_that_is_not_known_to_be_right_nothing_is_reliable(
+    fit: Fit, before: Region, after: Region
+) -> None:
+    check = CalibrationCheck(fit, {}, 100)
+    numbers = evidence().as_json()
+    verdict = Verdict(before, "admm tv", 0.1, (), numbers).with_calibration(check)
+    assert (verdict.region, verdict.calibration) == (after, check)
+    assert ("does not belong to this photograph" in verdict.sentences[0]) == (fit is Fit.FOREIGN)
+    is_said = "does not tell whether the calibration is its own" in verdict.sentences[0]
+    assert is_said == (fit is Fit.UNTOLD and before is Region.INSIDE)
+
+
+def test_a_little_less_light_than_in_good_cases_is_relieved_by_as_much() -> None:
+    told = Told(0.6, signal=0.9)
+    (dim,) = judged(told, detail=45.0, signal=30.0, unexplained=0.001).findings
+    assert dim.gain == pytest.approx(0.9 * np.log(40.1 / 30.1), rel=0.02)
+
+
+def test_far_from_all_cases_little_sets_it_apart_too_and_what_decides_keeps_its_gain() -> None:
+    told = Told(0.1)
+    load = told.features.index("load")
+    told.distance = lambda place: 4 + 0.2 * abs(float(place[load] - told.typical[load]))  # type: ignore[method-assign]
+    (apart,) = judged(told, load=0.1).findings
+    assert apart.gain == pytest.approx(0.2 * np.log(0.105 / 0.055), rel=1e-3)
+    first, second = judged(Told(0.1, load=0.1, unexplained=0.03), load=0.5, unexplained=0.2).findings
+    assert (first.stress, first.gain) == ("unexplained", pytest.approx(0.03 * np.log(0.22 / 0.03), rel=1e-3))
+    assert (second.stress, second.gain) == ("load", pytest.approx(0.1 * np.log(0.505 / 0.055), rel=1e-3))
+
+
+def test_what_is_unexplained_is_named_with_no_gain_where_it_alone_decided_and_not_where_it_did_not() -> None:
+    first, _ = judged(Told(0.1, load=0.1), load=0.5, unexplained=0.2).findings
+    assert (first.stress, first.gain) == ("unexplained", 0)
+    near = judged(Told(0.3, load=0.1), load=0.5, unexplained=0.02)
+    assert (near.region, [finding.stress for finding in near.findings]) == (Region.NEAR, ["load"])
 
 
 def test_names_of_methods_are_the_maps() -> None:
