@@ -158,6 +158,7 @@ def test_a_background_has_five_by_five_frequencies_or_as_many_as_there_are_pixel
     )
     n = np.arange(8) + 0.5
     np.testing.assert_allclose(small.basis(0)[1][0], np.full(8, 8**-0.5))
+    np.testing.assert_allclose(small.basis(0)[1][1], np.cos(np.pi * n / 8) / 2)
     np.testing.assert_allclose(small.basis(0)[1][3], np.cos(np.pi * 3 * n / 8) / 2)
 
 
@@ -180,6 +181,13 @@ def test_of_each_channel_the_nearest_smooth_image_without_negative_light_is_take
     positive = 7 + np.cos(np.pi * (np.arange(24) + 0.5) / 24) + np.zeros((2, 30, 1))
     np.testing.assert_allclose(removal.non_negative(positive), positive, atol=1e-9)
     assert not removal.non_negative(np.zeros((2, 30, 24))).any()
+
+
+def test_between_the_points_that_are_asked_a_background_is_lifted_to_nothing() -> None:
+    removal = BackgroundRemoval((1, 2, 301), (1, 5), dtype=np.float64)
+    for _ in range(5):
+        found = removal.non_negative(RNG.normal(size=5) @ removal.basis(0)[1] * 9 + np.zeros((1, 2, 1)) - 0.2)
+        assert 0 <= found.min() < 1e-9
 
 
 def test_light_beyond_the_sensor_is_as_at_the_patterns_edge() -> None:
