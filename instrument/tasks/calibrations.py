@@ -22,12 +22,28 @@ if TYPE_CHECKING:
     from recon.analysis.compare import Comparison
 
 
+def _with_calibration(text: str) -> Path:
+    """Return the folder that somebody named, which holds a calibration; FileError where it does not.
+
+    It is looked at before what else is missing is asked for.
+    """
+    from instrument.files.calibration_file import find_calibration
+
+    path = Path(text)
+    find_calibration(path.expanduser())
+    return path
+
+
 @dataclass(frozen=True, kw_only=True)
 class AnalysisFiles:
     """What an analysis reads, and what it writes."""
 
     calibration: Path = option(
-        help="A calibration, or a run with one.", metavar="CALIBRATION", positional=True, group="Files"
+        help="A calibration, or a run with one.",
+        metavar="CALIBRATION",
+        positional=True,
+        group="Files",
+        parse=_with_calibration,
     )
     out: Path = option(
         Path("analysis.pdf"),
@@ -49,7 +65,10 @@ class RefocusOptions:
     """Which PSFs are brought to which depths, and over the field."""
 
     calibration: Path = option(
-        help="A calibration, or a run with one.", metavar="CALIBRATION", positional=True
+        help="A calibration, or a run with one.",
+        metavar="CALIBRATION",
+        positional=True,
+        parse=_with_calibration,
     )
     z_um: tuple[float, ...] = option(
         help="Depth wanted; repeatable. inf: light that comes in parallel.",
@@ -77,8 +96,12 @@ class RefocusOptions:
 class CompareOptions:
     """Which calibrations are compared."""
 
-    old: Path = option(help="A calibration, or a run with one.", metavar="OLD", positional=True)
-    new: Path = option(help="A later one of the same camera.", metavar="NEW", positional=True)
+    old: Path = option(
+        help="A calibration, or a run with one.", metavar="OLD", positional=True, parse=_with_calibration
+    )
+    new: Path = option(
+        help="A later one of the same camera.", metavar="NEW", positional=True, parse=_with_calibration
+    )
     out: Path | None = option(
         None, help="Write the figures as JSON.", metavar="FILE", flags=("--out", "-o"), label="Figures"
     )

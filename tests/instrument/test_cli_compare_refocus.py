@@ -16,6 +16,7 @@ from drivers.simulated.options import WorldOptions
 from drivers.simulated.world import SimulatedWorld
 from instrument.cli import main
 from instrument.files.calibration_file import load_calibration, save_calibration
+from instrument.files.images import write_image
 from recon.types import Calibration
 
 WORLD = SimulatedWorld(WorldOptions(preset="tiny", time_scale=0.0))
@@ -110,6 +111,19 @@ def test_the_angular_response_makes_a_field_of_one_psf(
 def test_depths_that_make_no_sense_are_refused(depths: list[str], folder: Path, tmp_path: Path) -> None:
     assert main(["refocus", str(folder / "calibration"), *depths, "--out", str(tmp_path / "x")]) == 2
     assert not (tmp_path / "x").exists()
+
+
+def test_what_is_no_calibration_is_said_before_the_options_that_are_missing(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    psf = tmp_path / "psf.tif"
+    write_image(psf, np.ones((8, 8), np.uint16))
+    assert main(["refocus", str(psf)]) == 2
+    first, second, third = capsys.readouterr().err.splitlines()[-3:]
+    assert "psf.tif: is no folder; a calibration or a run folder is expected." in first
+    assert "reconstruct takes one by --psf FILE" in first
+    assert second.startswith("--z-mm must be given")
+    assert third.startswith("--out must be given")
 
 
 def test_a_reconstruction_between_depths_says_how_its_psf_was_made(
