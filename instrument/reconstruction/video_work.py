@@ -229,8 +229,7 @@ def at_once(blocks: int, video: VideoOptions, *, together: bool) -> int:
         return video.workers
     if video.scheduler is not None:
         with _client_of(_dask(), video.scheduler, video.scheduler_owner) as client:
-            crew = client.scheduler_info(n_workers=-1)["workers"].values()
-        return max(sum(int(worker["nthreads"]) for worker in crew), 1)
+            return max(sum(_crew(client).values()), 1)
     return 1 if together else max(1, min(get_threads(), blocks))
 
 
@@ -246,7 +245,8 @@ def on_cluster(
     """Solve blocks on a Dask cluster whose workers see the same files; raises as :func:`in_process`.
 
     A block whose worker is lost is solved by another; the loss is logged, and ``on_lost`` told how many were.
-    Raises BenchError where every worker that took a block was lost, or other programs are installed there.
+    Raises BenchError where every worker that took a block was lost, or the scheduler, or other programs are
+    installed there.
     """
     work = partial(solve_block, str(job), str(output), threads=1)
     # Not pure: a block is worked on again whatever the cluster has seen before.
@@ -255,7 +255,7 @@ def on_cluster(
     crew: set[str] = set()
     try:
         while left:
-            here = set(client.scheduler_info(n_workers=-1)["workers"])
+            here = set(_crew(client))
             if lost := len(crew - here):
                 _log.warning(
                     "%s ended or cannot be reached: blocks begun there begin anew on another. Where it "
@@ -286,6 +286,24 @@ def on_cluster(
                 raise CancelledError
     finally:
         client.cancel(list(left))
+
+
+def _crew(client: Any) -> dict[str, int]:
+    """Return the threads of each worker that a cluster has now, by its address.
+
+    The client's ``scheduler_info`` also keeps the answer to a question of its own, every two seconds and
+    without the workers: on a busy machine it gave that one, as if all of them had been lost.
+
+    Raises BenchError where the scheduler is gone.
+    """
+    try:
+        crew: dict[str, int] = client.nthreads()
+    except OSError as error:
+        raise BenchError(
+            "The cluster's scheduler ended or can no longer be reached. Blocks that are done are kept: start "
+            "it again, and the same command goes on."
+        ) from error
+    return crew
 
 
 @contextlib.contextmanager
@@ -324,6 +342,9 @@ def cluster(
             protocol="tls://",
             security=security,
             dashboard_address=None,
+            scheduler_kwargs={
+                "dashboard_address": "127.0.0.1:0"
+            },  # else 8787, which another cluster may have
             silence_logs=50,
         ) as local,
         distributed.Client(local) as client,
@@ -352,10 +373,10 @@ def _dask() -> Any:
     # Its own configuration says INFO; silence_logs of a local cluster is taken back too early. What becomes
     # of workers is told in our own words.
     logging.getLogger("distributed").setLevel(logging.WARNING)
-    for quiet in ("nanny", "client"):
-        logging.getLogger(f"distributed.{quiet}").setLevel(logging.ERROR)
+    logging.getLogger("distributed.nanny").setLevel(logging.ERROR)
     # A result that was lost with its worker before it was fetched is an error there, and is made again.
-    logging.getLogger("distributed.scheduler").setLevel(logging.CRITICAL)
+    for quiet in ("client", "scheduler"):
+        logging.getLogger(f"distributed.{quiet}").setLevel(logging.CRITICAL)
     return distributed
 
 

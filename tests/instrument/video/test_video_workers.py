@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import importlib
 import os
 import pickle
 import signal
@@ -109,6 +110,7 @@ def test_a_cluster_here_takes_work_from_its_owner_only() -> None:
         known = client.scheduler_info()
         ports = [port for one in (known, *known["workers"].values()) for port in one["services"].values()]
         assert ports
+        assert 8787 not in ports  # another cluster's, as a rule
         for port in ports:
             with socket.create_connection(("127.0.0.1", port), timeout=10) as page:
                 page.sendall(b"GET /info/main/workers.html HTTP/1.0\r\n\r\n")
@@ -160,8 +162,8 @@ def test_workers_that_are_lost_are_told(tmp_path: Path, caplog: pytest.LogCaptur
         def submit(self, *_: object, **__: object) -> Future:
             return Future()
 
-        def scheduler_info(self, n_workers: int) -> dict[str, set[str]]:
-            return {"workers": next(self.crews)}
+        def nthreads(self) -> dict[str, int]:
+            return dict.fromkeys(next(self.crews), 1)
 
         def cancel(self, left: list[object]) -> None:
             self.cancelled = left
@@ -198,8 +200,8 @@ def test_a_scheduler_or_worker_without_this_program_is_said(
         def submit(self, *_: object, **__: object) -> Future:
             return Future()
 
-        def scheduler_info(self, n_workers: int) -> dict[str, dict[str, object]]:
-            return {"workers": {}}
+        def nthreads(self) -> dict[str, int]:
+            return {}
 
         def cancel(self, left: list[Future]) -> None:
             assert left
@@ -214,6 +216,51 @@ def test_a_scheduler_or_worker_without_this_program_is_said(
     )
     with pytest.raises(expected, match=words):
         on_cluster(Client(), tmp_path, tmp_path, [0], lambda _: None, threading.Event())
+
+
+def test_a_scheduler_that_ends_is_said(tmp_path: Path) -> None:
+    pytest.importorskip("distributed")
+
+    class Future:
+        def done(self) -> bool:
+            return False
+
+    class Client:
+        def submit(self, *_: object, **__: object) -> Future:
+            return Future()
+
+        def nthreads(self) -> dict[str, int]:
+            raise OSError("ConnectionPool closing.")
+
+        def cancel(self, _: object) -> None:
+            pass
+
+    with pytest.raises(BenchError, match=r"The cluster's scheduler ended.*the same command goes on"):
+        on_cluster(Client(), tmp_path, tmp_path, [0], lambda _: None, threading.Event())
+
+
+def test_workers_that_are_there_are_not_told_as_lost(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    distributed = pytest.importorskip("distributed")
+    numbers = iter(range(9))
+
+    def solved(*_: object, **__: object) -> BlockReport:
+        time.sleep(1)
+        return BlockReport(next(numbers), 1, 1, 1.0)
+
+    # A client asks by itself, without the workers, and keeps that answer as the last one.
+    often = {"distributed.client.scheduler-info-interval": "1ms"}
+    monkeypatch.setattr(block_module, "solve_block", solved)
+    monkeypatch.setattr(block_module, "_POLL_S", 0.01)
+    lost: list[int] = []
+    with (
+        importlib.import_module("dask.config").set(often),
+        distributed.LocalCluster(
+            n_workers=1, threads_per_worker=1, processes=False, dashboard_address="127.0.0.1:0"
+        ) as here,
+        distributed.Client(here) as client,
+    ):
+        on_cluster(client, tmp_path, tmp_path, [0, 1], lambda _: None, threading.Event(), lost.append)
+    assert lost == []
 
 
 def test_a_scheduler_that_is_not_there_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
