@@ -344,16 +344,21 @@ class MainWindow(QMainWindow):
 
         Qt's own way stops at parts that hand the keyboard on to another as well, wherever they are in its
         order: it went round within a panel, and never came to STOP. And it goes on from a part that is put
-        off while it works, to a field that takes what is typed then: the keyboard waits until it is on again.
+        off or hidden while it works, to a field that takes what is typed then: the keyboard waits until it is
+        there again, and Tab goes on from where it stood.
         """
         stops, now = list(stops_of(self)), QApplication.focusWidget()
-        if now is not None and not now.isEnabled():
+        if now is not None and not self._kept.takes(now):
             self._kept.keep(now)
+            now.clearFocus()
             return False
-        if now not in stops:
+        if now in stops:
+            to: QWidget | None = stops[(stops.index(now) + (1 if forward else -1)) % len(stops)]
+        else:
+            to = None if now is not None else self._kept.neighbour(stops, forward=forward)
+        if to is None:
             return super().focusNextPrevChild(forward)
-        reason = Qt.FocusReason.TabFocusReason if forward else Qt.FocusReason.BacktabFocusReason
-        stops[(stops.index(now) + (1 if forward else -1)) % len(stops)].setFocus(reason)
+        to.setFocus(Qt.FocusReason.TabFocusReason if forward else Qt.FocusReason.BacktabFocusReason)
         return True
 
     # What runs -----------------------------------------------------------------------------------

@@ -20,6 +20,7 @@ from PySide6.QtWidgets import (
     QTabWidget,
     QWidget,
 )
+from shiboken6 import isValid
 
 
 def tab_in_order(root: QWidget, *, after: QWidget | None = None) -> None:
@@ -50,21 +51,50 @@ def hand_on(to: QWidget, leaving: Sequence[QWidget]) -> None:
 
 
 class Kept(QObject):
-    """Keeps the keyboard's place while the part that had it is off: keys go to no field beside it."""
+    """Keeps the place of the keyboard while the part that had it is off or hidden: no field takes keys."""
 
-    part: QWidget | None = None
+    def __init__(self, window: QWidget) -> None:
+        super().__init__(window)
+        self._window = window
+        self._part: QWidget | None = None
+        app = QApplication.instance()
+        assert isinstance(app, QApplication)
+        app.focusChanged.connect(self._changed)
+
+    @staticmethod
+    def takes(part: QWidget) -> bool:
+        """Whether a part can have the keyboard now."""
+        return part.isEnabled() and part.isVisible()
 
     def keep(self, part: QWidget) -> None:
-        """Give the keyboard back to a part as soon as it is on again, unless another has it by then."""
-        self.part = part
+        """Give the keyboard back to a part as soon as it is there again, unless another has it by then."""
+        self._part = part
         part.installEventFilter(self)
+
+    def neighbour(self, stops: Sequence[QWidget], *, forward: bool) -> QWidget | None:
+        """Return the stop beside the part that had the keyboard, where nobody has it; None where none did."""
+        if self._part is None or not isValid(self._part) or not stops:
+            return None
+        part: QWidget | None = self._part
+        while part is not None and part not in stops:
+            part = part.nextInFocusChain() if forward else part.previousInFocusChain()
+            if part is self._part:
+                return None
+        return part
+
+    def _changed(self, old: QWidget | None, new: QWidget | None) -> None:
+        """See that nobody has the keyboard because a whole form was put off."""
+        left = new is None and old is not None and isValid(old) and isValid(self._window)
+        if old is not None and left and self._window.isAncestorOf(old) and not self.takes(old):
+            self.keep(old)
 
     def eventFilter(self, watched: QObject, event: QEvent) -> bool:  # noqa: N802 - Qt's name
         """See the part that had the keyboard come back."""
-        if event.type() == QEvent.Type.EnabledChange and isinstance(watched, QWidget) and watched.isEnabled():
+        came = event.type() in (QEvent.Type.EnabledChange, QEvent.Type.Show)
+        if came and isinstance(watched, QWidget) and self.takes(watched):
             watched.removeEventFilter(self)
-            if self.part is watched:
-                self.part = None
+            if self._part is watched:
+                self._part = None
                 if QApplication.focusWidget() is None:
                     watched.setFocus()
         return False
