@@ -25,6 +25,7 @@ from instrument.bench.config_file import no_bench
 from instrument.files import kept_times
 from instrument.files.errors import BenchError, in_words
 from instrument.live.frame_view import compile_for_frames
+from recon.base.threads import stand_back
 from recon.optics.jit import extensions_put_off
 
 _FRAME = QSize(16, 40)
@@ -99,6 +100,7 @@ def _shown(app: QApplication, config: BenchConfig, settings: QSettings) -> tuple
 def show_and_open(window: MainWindow) -> None:
     """Show a window, and open its bench when it was seen: what takes long is done before there is light."""
     sys.setswitchinterval(HANDOVER_S)
+    stand_back()
     load = extensions_put_off()  # before panels are prepared, which begins with the first events
     application().processEvents()  # to be made and to be shown are turns of their own
     window.show()

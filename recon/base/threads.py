@@ -11,15 +11,19 @@ and its library's own threads wait for each other by spinning on the cores that 
 from __future__ import annotations
 
 import os
+import sys
 import threading
 from collections.abc import Callable, Iterator, Sized
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from functools import lru_cache
 from typing import Any
 
+_STEP_BACK = 10
+"""In the system's units of niceness: a tenth of the share that the main thread has of a core."""
 _lock = threading.Lock()
 _inside = threading.local()
+_stands_back = False
 _threads = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else (os.cpu_count() or 1)
 
 
@@ -37,9 +41,37 @@ def set_threads(threads: int) -> None:
         _threads = int(threads)
 
 
+def stand_back() -> None:
+    """Have threads that compute in blocks let the main one go first from now on; on Linux, elsewhere nothing.
+
+    For a window: its thread is to answer while they have every core. What stands back does so for good: only
+    an administrator may raise what was lowered.
+    """
+    global _stands_back
+    _stands_back = sys.platform == "linux"
+
+
+def _let_main_go_first() -> None:
+    if not _stands_back or getattr(_inside, "back", False):
+        return
+    _inside.back = True
+    own, main = threading.get_native_id(), os.getpid()
+    if own == main:
+        return
+    with suppress(OSError):  # where a sandbox has no priorities, all stay equal
+        least = os.getpriority(os.PRIO_PROCESS, main) + _STEP_BACK
+        if os.getpriority(os.PRIO_PROCESS, own) < least:  # a thread begins with what its maker has
+            os.setpriority(os.PRIO_PROCESS, own, least)
+
+
 @lru_cache(maxsize=1)
 def _pool(threads: int) -> ThreadPoolExecutor:
-    return ThreadPoolExecutor(threads, thread_name_prefix="recon", initializer=stay_alone)
+    return ThreadPoolExecutor(threads, thread_name_prefix="recon", initializer=_join_pool)
+
+
+def _join_pool() -> None:
+    stay_alone()
+    _let_main_go_first()
 
 
 def stay_alone() -> None:
@@ -71,6 +103,7 @@ def in_blocks(kernel: Callable[[int, int], object], length: int, *, grain: int =
     grain : int
         Smallest block worth a thread.
     """
+    _let_main_go_first()
     blocks = min(_threads, max(length // max(grain, 1), 1))
     if blocks <= 1 or getattr(_inside, "pool", False):
         kernel(0, length)

@@ -1,5 +1,7 @@
 """The one place for threads: linear algebra keeps out of the way of the program's own."""
 
+import subprocess
+import sys
 import threading
 
 import pytest
@@ -71,3 +73,36 @@ def test_it_is_one_in_whichever_thread_asks_after_another() -> None:
     ask()
     assert seen == [{1}] * 4
     assert threads() == {2}
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="threads have priorities of their own on Linux only")
+def test_threads_that_compute_let_the_main_one_go_first_where_a_window_asks_for_it() -> None:
+    script = """
+import os, threading
+from recon.base import threads
+def niceness(*_):
+    seen.append(os.getpriority(os.PRIO_PROCESS, threading.get_native_id()))
+def compute():
+    threads.in_blocks(niceness, 2)
+def in_a_thread():
+    other = threading.Thread(target=compute)
+    other.start()
+    other.join()
+    told.append(list(seen))
+    seen.clear()
+seen, told = [], []
+threads.set_threads(2)
+main = os.getpriority(os.PRIO_PROCESS, os.getpid())
+in_a_thread()
+threads._pool.cache_clear()
+threads.stand_back()
+in_a_thread()
+in_a_thread()  # by a thread that the pool has already
+threads.set_threads(1)
+compute()  # in the main thread itself
+assert told[0] == [main] * 2, told
+assert all(each > main for each in told[1] + told[2]), told
+assert len(set(told[1] + told[2])) == 1, told
+assert seen == [main], seen
+"""  # in a process of its own: who stands back does so for good
+    subprocess.run([sys.executable, "-c", script], check=True)
