@@ -122,8 +122,8 @@ def point_places(
     PointPlaces
         Places, micrometres, and light, the brightest first, each with its deviation.
 
-    Raises InputError when there is one plane, one is not in front of the diffuser, or there are more points
-    than are told apart.
+    Raises InputError when there is one plane, one is not in front of the diffuser, two are at the same depth,
+    or there are more points than are told apart.
     """
     if grid.shape[0] < 2:
         raise InputError("Points in depth are found in volumes of two planes or more; this has one.")
@@ -131,6 +131,13 @@ def point_places(
         raise InputError(
             f"Plane {behind[0]} is at {grid.z_um[behind[0]]:g} um; depths are counted from the diffuser and "
             "are above 0: no ray through it goes to planes in it or behind it. Leave them out."
+        )
+    order = np.argsort(grid.z_um, kind="stable")
+    if (same := np.flatnonzero(np.diff(1 / grid.z_um[order]) == 0)).size:
+        first, second = sorted(order[same[0] : same[0] + 2].tolist())
+        raise InputError(
+            f"Planes {first} and {second} are at the same depth, {grid.z_um[first]:g} um: a point has no "
+            "place between them. Leave one out."
         )
     read = volume if callable(volume) else volume.__getitem__
     light, summed, factors = in_whole_steps(lambda z: _light(read(z)), grid)

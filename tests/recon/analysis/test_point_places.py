@@ -213,3 +213,12 @@ def test_planes_of_very_different_depths_are_searched_no_farther_than_their_edge
     cells = 2 * (SHAPE[0] // module.CELL + 1) * (SHAPE[1] // module.CELL + 1)
     assert found
     assert len(looked) <= cells * np.count_nonzero(volume >= 0.9 * volume.max())
+
+
+@pytest.mark.parametrize(
+    ("z_um", "said"), [([2e4, 1e4, 2e4], "Planes 0 and 2"), ([1.0, 1.0], "Planes 0 and 1")]
+)
+def test_planes_at_the_same_depth_are_refused(z_um: list[float], said: str) -> None:
+    grid = grid_of(np.array(z_um))
+    with pytest.raises(InputError, match=f"{said} are at the same depth"):
+        point_places(np.ones(grid.shape, np.float32), grid)
