@@ -11,6 +11,22 @@ import numpy as np
 import numpy.typing as npt
 
 
+def _threads() -> set[Path]:
+    """Return this program's threads as the system lists them; none on other systems than Linux."""
+    try:
+        return set(Path("/proc/self/task").iterdir())
+    except OSError:
+        return set()
+
+
+def _computed_s(thread: Path) -> float:
+    try:
+        said = (thread / "stat").read_text()
+    except OSError:  # over
+        return 0.0
+    return sum(map(int, said.rpartition(")")[2].split()[11:13])) / os.sysconf("SC_CLK_TCK")
+
+
 class Look:
     """Light that is computed in a thread of its own: who ends an exposure does not wait for it.
 
@@ -25,6 +41,7 @@ class Look:
         self._seen: npt.NDArray[np.float32] | None = None
         self._error: Exception | None = None
         self._over = threading.Event()
+        self._others = _threads()
         self.thread = threading.Thread(target=self._run, name="simulated light", daemon=True)
         self.thread.start()
 
@@ -37,12 +54,14 @@ class Look:
             self._over.set()
 
     def computed_s(self) -> float:
-        """Return how long the thread has computed, seconds of the processor; 0 where that is not said."""
-        try:
-            said = Path(f"/proc/self/task/{self.thread.native_id}/stat").read_text()
-        except OSError:  # over, or another system than Linux
+        """Return how long its thread and those that began since have computed, seconds of the processor.
+
+        Light of many beads is shared among threads, which its own then waits for. 0 where it is over, and
+        where a system does not say.
+        """
+        if not self.thread.is_alive():
             return 0.0
-        return sum(map(int, said.rpartition(")")[2].split()[11:13])) / os.sysconf("SC_CLK_TCK")
+        return sum(_computed_s(thread) for thread in _threads() - self._others)
 
     def give_up(self) -> None:
         """Let go of who waits; what is being computed is kept by the world."""

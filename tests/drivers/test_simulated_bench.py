@@ -7,6 +7,7 @@ import threading
 import time
 import tracemalloc
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import numpy.typing as npt
@@ -323,8 +324,9 @@ def test_stop_does_not_wait_until_a_new_light_is_computed(monkeypatch: pytest.Mo
     assert not any(thread.name == "simulated light" for thread in threading.enumerate())
 
 
+@pytest.mark.parametrize("shared", [False, True], ids=["in its thread", "in others that it waits for"])
 def test_what_a_light_takes_of_the_processor_is_told_and_waiting_is_none(
-    monkeypatch: pytest.MonkeyPatch,
+    monkeypatch: pytest.MonkeyPatch, shared: bool
 ) -> None:
     bench = Bench()
     waits, ends = threading.Event(), threading.Event()
@@ -338,7 +340,13 @@ def test_what_a_light_takes_of_the_processor_is_told_and_waiting_is_none(
         assert ends.wait(20.0)
         return see(weights, binning)
 
-    monkeypatch.setattr(bench.world, "photons_per_s", busy_then_waiting)
+    def seen(weights: Rgb, binning: int = 1) -> object:
+        if not shared:
+            return busy_then_waiting(weights, binning)
+        with ThreadPoolExecutor(1) as pool:  # as beads are rendered
+            return pool.submit(busy_then_waiting, weights, binning).result()
+
+    monkeypatch.setattr(bench.world, "photons_per_s", seen)
     assert bench.camera.computed_s() == 0
     bench.camera.start_sequence()
     assert waits.wait(20.0)
