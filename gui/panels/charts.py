@@ -144,6 +144,8 @@ def _read(path: Path) -> dict[str, Any] | ChartData:
             raise no_maps from None
 
 
+_EVEN_STEPS = 5
+"""On an axis that is too short for ticks at 1, 2 and 5, at most."""
 _NEAR_PX = 12.0
 _ROW_PX = 38
 """Two lines: settings differ by their ends."""
@@ -309,10 +311,21 @@ def _steps(front: Sequence[tuple[float, float]]) -> list[tuple[float, float]]:
 
 
 def _ticks(costs: Sequence[float]) -> list[tuple[float, str]]:
-    """Return places of 1, 2 and 5 times powers of ten on a logarithmic axis, with their words."""
-    first, last = math.floor(math.log10(min(costs))), math.ceil(math.log10(max(costs)))
+    """Return places on a logarithmic axis, with their words: 1, 2 and 5 times powers of ten.
+
+    Where fewer than two of those lie among the costs, even steps do, and a single cost is its own place.
+    """
+    low, high = min(costs), max(costs)
+    first, last = math.floor(math.log10(low)), math.ceil(math.log10(high))
     values = [step * 10.0**power for power in range(first, last + 1) for step in (1, 2, 5)]
-    return [(math.log10(value), f"{value:g}") for value in values]
+    if sum(low <= value <= high for value in values) < 2:
+        values = [low]
+        if high > low:
+            apart = (high - low) / _EVEN_STEPS
+            power = 10.0 ** math.floor(math.log10(apart))
+            step = next(step * power for step in (1, 2, 5, 10) if step * power >= apart)
+            values = [number * step for number in range(math.ceil(low / step), math.floor(high / step) + 1)]
+    return [(math.log10(value), f"{value:.6g}") for value in values]
 
 
 def describe(point: Point, kind: str = "reconstruction") -> str:

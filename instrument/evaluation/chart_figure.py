@@ -228,13 +228,16 @@ def _common_words(names: Mapping[str, object]) -> frozenset[str]:
 
 def _scale(axis: XAxis | YAxis, values: Sequence[float], *, logarithmic: bool) -> None:
     """Have an axis hold what is drawn as lines: faint points far off would press them together."""
+    from matplotlib.ticker import LogLocator, MaxNLocator, NullFormatter, StrMethodFormatter
+
     low, high = min(values), max(values)
     set_limits = axis.axes.set_xlim if axis.axis_name == "x" else axis.axes.set_ylim
     if not logarithmic or low <= 0 or high <= _NARROW * low:
         rim = 0.06 * (high - low) or 0.1 * abs(high) or 1.0
         set_limits(low - rim, high + rim)
+        if axis.axis_name == "x":  # words of many digits beside each other
+            axis.set_major_locator(MaxNLocator(5))
         return
-    from matplotlib.ticker import LogLocator, NullFormatter, StrMethodFormatter
 
     rim = (high / low) ** 0.06
     (axis.axes.set_xscale if axis.axis_name == "x" else axis.axes.set_yscale)("log")

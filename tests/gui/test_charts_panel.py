@@ -12,7 +12,7 @@ from PySide6.QtWidgets import QApplication, QGraphicsSimpleTextItem
 from pytestqt.qtbot import QtBot
 
 from gui.panel import whole
-from gui.panels.charts import ChartsPanel, describe
+from gui.panels.charts import ChartsPanel, _ticks, describe
 from instrument.evaluation.chart import read_chart
 from instrument.evaluation.figures import boundary_lines, map_figure
 from instrument.files.errors import FileError
@@ -268,3 +268,18 @@ def test_a_chart_of_another_version_is_refused(qtbot: QtBot, panel: ChartsPanel,
     path.write_text("no JSON")
     panel.open(path)
     qtbot.waitUntil(lambda: "is no valid JSON" in panel._note.toolTip(), timeout=WAIT_MS)
+
+
+@pytest.mark.parametrize(
+    ("costs", "words"),
+    [
+        ([0.15, 2.4], ["0.1", "0.2", "0.5", "1", "2", "5", "10", "20", "50"]),
+        ([0.902, 0.916], ["0.905", "0.91", "0.915"]),
+        ([0.55, 1.1], ["0.6", "0.8", "1"]),
+        ([0.523], ["0.523"]),
+    ],
+)
+def test_the_axis_of_costs_has_figures_however_close_they_lie(costs: list[float], words: list[str]) -> None:
+    ticks = _ticks(costs)
+    assert [word for _, word in ticks] == words
+    assert all(abs(10**place - float(word)) < 1e-9 for place, word in ticks)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from io import BytesIO
+from itertools import pairwise
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -98,3 +99,18 @@ def test_a_long_title_ends_before_the_mark_of_what_is_simulated() -> None:
     title = next(text for text in figure.texts if text.get_text().endswith("pixels"))
     mark = next(text for text in figure.texts if text.get_text() == "SIMULATED")
     assert title.get_window_extent().x1 < mark.get_window_extent().x0 - 10
+
+
+def test_figures_of_costs_that_lie_close_stand_apart() -> None:
+    points = tuple(
+        replace(_points(1)[0], iterations=n, seconds=0.9 + 0.0004 * n, psnr_db=24.3 + 0.001 * n)
+        for n in (5, 10, 20, 40)
+    )
+    figure = chart_figure(ChartData("reconstruction", {"simulated": True}, points, {}, ()))
+    figure.savefig(BytesIO())
+    for axes in figure.axes:
+        low, high = axes.get_xlim()
+        shown = [t for t in axes.get_xticklabels() if low <= t.get_position()[0] <= high]
+        ends = sorted((Text.get_window_extent(t).x0, Text.get_window_extent(t).x1) for t in shown)
+        assert len(ends) > 1
+        assert all(later[0] - earlier[1] > earlier[1] - earlier[0] for earlier, later in pairwise(ends))
