@@ -62,7 +62,9 @@ def look_into(path: Path, *, read: bool = False, on_progress: Progress | None = 
         looked = verify(run, on_progress, read=read)
         about = _about_run(run, looked)
         if read:
-            about.insert(1, f"{looked.frames} frames read back: {'sound' if looked.is_sound else 'DAMAGED'}")
+            about.insert(
+                1, f"{looked.frames} of {len(run.records)} frames read back are as they were written"
+            )
         held = (SWEEP.kept(path), PHOTOGRAPH.kept(path))
         to_use = next((each for each in held if each.exists()), None)
         return Opened(path, run, sorted(run.records), about, can_go_on(run, looked), to_use)
@@ -122,7 +124,7 @@ def _about_photograph(path: Path) -> list[str]:
 
 def _about_run(run: Run, looked: Verification) -> list[str]:
     """Return what is known of a run, a line each."""
-    lines = [f"{looked.became}: {len(run.records)} of {run.n_frames} frames"]
+    lines = [f"{looked.became}: {len(run.records)} of {run.n_frames} frames taken"]
     lines[0] += "  SIMULATED" if run.is_simulated else ""
     if run.error:
         lines.append(run.error)

@@ -140,4 +140,8 @@ def test_calibrate_photograph_and_reconstruct_by_mouse_alone(qtbot: QtBot, windo
     assert runs.about.toPlainText().startswith("completed: ")
     qtbot.mouseClick(runs.verify_button, LEFT)
     qtbot.waitUntil(lambda: runs.table.item(0, 1).text() == "completed, DAMAGED", timeout=WAIT_MS)
-    assert runs.about.toPlainText().startswith("completed, DAMAGED: ")
+    taken = len(runs.opened.run.records)
+    assert runs.about.toPlainText().splitlines()[:2] == [
+        f"completed, DAMAGED: {taken} of {taken} frames taken  SIMULATED",
+        f"{taken - 1} of {taken} frames read back are as they were written",
+    ], "as if all were damaged"
