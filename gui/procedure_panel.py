@@ -461,7 +461,9 @@ class ProcedurePanel(Panel):
             self._doubted = frozenset()
             how, _, _ = self.run_bar.words.text().partition(";")
             self.run_bar.words.setText(f"{how}; connected again since. STOP makes sure that it is safe")
-            mark(self.verdict, "refused", False)
+            self._said_at_end = ""  # the log keeps it
+            self._say("", wrong=False)
+            self.check()
 
     def _over(self) -> None:
         self.accepted()  # what ended it stands below the form

@@ -290,6 +290,7 @@ def test_after_a_fault_the_way_on_is_a_button_where_it_happened(
         qtbot.waitUntil(lambda: session.is_open("camera"), timeout=WAIT_MS)
         assert ("Failed; connected again" in panel.run_bar.words.text()) is settled
         assert panel.verdict.property("refused") is not settled
+        assert ("did not answer" in panel.verdict.toPlainText()) is not settled, "its cause is gone"
 
 
 def answer(question: QMessageBox | None, words: str) -> Any:
