@@ -1,4 +1,4 @@
-"""How soon the window shows a simulated scene: seconds of the processor since the program's start.
+"""How soon the window shows a simulated scene: seconds of the processor, and by the clock, since the start.
 
 The terminal's command is counted, too. Each preset starts twice in processes of their own: with nothing kept
 of its light on disk, and with what the first start left there. Compiled kernels are there both times. Last,
@@ -19,6 +19,7 @@ import sys
 import tempfile
 import threading
 import time
+from dataclasses import dataclass
 from pathlib import Path
 from types import FrameType
 from typing import Any
@@ -28,6 +29,29 @@ PRESETS = ("tiny", "pointgrey", "pco")
 LIMIT_S = 120.0
 LIT = 1e-3
 """Of full scale, in the mean of all pixels: a frame of the scene."""
+
+
+@dataclass(frozen=True, slots=True)
+class Spent:
+    """Seconds of the processor, of the whole process, and by the clock."""
+
+    cpu_s: float
+    clock_s: float
+
+    @classmethod
+    def now(cls) -> Spent:
+        """Return both as they stand."""
+        return cls(time.process_time(), time.monotonic())
+
+    @classmethod
+    def since(cls, earlier: Spent) -> Spent:
+        """Return what was spent since then."""
+        now = cls.now()
+        return cls(now.cpu_s - earlier.cpu_s, now.clock_s - earlier.clock_s)
+
+    def __str__(self) -> str:
+        """Return both, the clock in brackets."""
+        return f"{self.cpu_s:.2f} ({self.clock_s:.2f})"
 
 
 def main() -> None:
@@ -90,7 +114,8 @@ def watch(preset: str) -> None:
 
 def look_on() -> None:
     """Look beside the program what its live view shows; ends the process."""
-    seen: dict[str, float] = {}
+    seen: dict[str, Spent] = {}
+    start = Spent(0.0, time.monotonic() - time.process_time())  # nothing was waited for until now
     maker: Any = None
     deadline = time.monotonic() + LIMIT_S
     while "scene" not in seen and time.monotonic() < deadline:
@@ -98,17 +123,17 @@ def look_on() -> None:
         if maker is None:
             maker = maker_of(sys._current_frames()[threading.main_thread().ident or 0])
             continue
-        seen.setdefault("window", time.process_time())
+        seen.setdefault("window", Spent.since(start))
         picture = getattr(maker.panels.get("live"), "picture", None)
         if picture is None:
             continue
         if picture.is_coarse:
-            seen.setdefault("coarse", time.process_time())
+            seen.setdefault("coarse", Spent.since(start))
         elif picture.frame is not None:
-            seen.setdefault("frame", time.process_time())
+            seen.setdefault("frame", Spent.since(start))
             above = float(picture.frame.image.mean()) - picture.frame.metadata.black_level
             if above > LIT * picture.frame.full_scale:
-                seen.setdefault("scene", time.process_time())
+                seen.setdefault("scene", Spent.since(start))
     if "scene" in seen:
         seen |= look_at_another(maker)
     else:
@@ -117,28 +142,28 @@ def look_on() -> None:
         )
         faulthandler.dump_traceback()
     columns = ("window", "coarse", "frame", "scene", "new coarse", "new frame")
-    print(" | ".join(f"{seen[key]:.2f}" if key in seen else "" for key in columns))
+    print(" | ".join(str(seen.get(key, "")) for key in columns))
     sys.stdout.flush()
     os._exit(0)
 
 
-def look_at_another(maker: Any) -> dict[str, float]:
-    """Put another slide before the camera; return when it was seen, seconds of the processor since."""
+def look_at_another(maker: Any) -> dict[str, Spent]:
+    """Put another slide before the camera; return when it was seen since."""
     picture = maker.panels["live"].picture
-    seen: dict[str, float] = {}
+    seen: dict[str, Spent] = {}
     rest = time.monotonic() + LIMIT_S
     while maker._session.jobs.jobs and time.monotonic() < rest:  # panels at the side are made
         time.sleep(0.1)
     camera = maker._session.bench.camera
-    began, deadline = time.process_time(), time.monotonic() + LIMIT_S
+    began, deadline = Spent.now(), time.monotonic() + LIMIT_S
     camera.world.change_slide(1)
     number = camera._next_id  # of the first frame that sees nothing else
     while "new frame" not in seen and time.monotonic() < deadline:
         time.sleep(0.005)
         if picture.is_coarse:
-            seen.setdefault("new coarse", time.process_time() - began)
+            seen.setdefault("new coarse", Spent.since(began))
         elif picture.frame.metadata.frame_id >= number:
-            seen["new frame"] = time.process_time() - began
+            seen["new frame"] = Spent.since(began)
     return seen
 
 
