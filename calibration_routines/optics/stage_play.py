@@ -26,7 +26,7 @@ from calibration_routines.psf.sampling import known, source_limits
 from calibration_routines.psf.sweep_plan import DARK
 from calibration_routines.purpose import CalibrationError, Purpose, completed
 from calibration_routines.routine import Routine
-from calibration_routines.scatter import Scatter, compare, growth, pooled
+from calibration_routines.scatter import Scatter, compare, growth, pooled, reduction
 from instrument.bench.bench import Bench
 from instrument.files.errors import BenchError, SettingsError
 from instrument.files.record import RecordFormat, plain
@@ -35,6 +35,7 @@ from instrument.plan.positions import StagePoints
 from instrument.runs.acquire import abilities_of
 from instrument.runs.run import Run
 from instrument.runs.run_control import RunControl
+from recon.base.blocks import block_mean
 from recon.base.declare import RARE, option
 from recon.camera.registration import moved
 from recon.types import Geometry
@@ -347,10 +348,11 @@ def _moved_um(image: Float, reference: Float, name: str, record: StageRecord) ->
     d_um, z_um = 1e3 * d_mm, record.z_um
     if not np.isfinite(change.shift_px):
         return float("nan")
-    larger, total = 0.0, image
+    factor, larger = reduction(reference), 0.0
+    seen, other = block_mean(image, factor), block_mean(reference, factor)
+    back = moved(seen, -change.rows / factor, -change.columns / factor)
     for _ in range(3):  # by Newton: the size is linear only while it changes little
-        total = _resized(moved(image, -change.rows, -change.columns), 1 / (1 + larger))
-        larger = (1 + larger) * (1 + growth(total, reference)) - 1
+        larger = (1 + larger) * (1 + growth(_resized(back, 1 / (1 + larger)), other)) - 1
     return float(-larger * z_um * (z_um + d_um) / d_um / (1 + larger * (z_um + d_um) / d_um))
 
 

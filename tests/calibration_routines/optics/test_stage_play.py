@@ -8,18 +8,21 @@ from unittest.mock import Mock
 
 import numpy as np
 import pytest
+from scipy import ndimage
 
+from calibration_routines.optics import stage_play
 from calibration_routines.optics.stage_play import (
     ROUTINES,
     AxisPlay,
     StageCheck,
     StagePlay,
     StageProcedure,
+    StageRecord,
     planned,
     stage_plan,
 )
 from calibration_routines.plan_procedures import _restore_after_gaps
-from calibration_routines.scatter import STEADY
+from calibration_routines.scatter import LARGEST_PX, STEADY, growth
 from drivers.simulated.world import SimulatedWorld
 from drivers.stage import approached
 from instrument.bench.bench import Bench, open_bench
@@ -28,6 +31,8 @@ from instrument.files.errors import SettingsError
 from instrument.plan import Part, Plan, SourcePoints, check, estimate
 from instrument.plan.model import PlanError
 from instrument.runs.acquire import abilities_of
+from recon.camera.registration import moved
+from recon.types import Geometry
 
 TINY = """
 [camera]
@@ -45,6 +50,7 @@ control = "simulated"
 preset = "tiny"
 time_scale = 0
 """
+LARGE = Geometry(pixel_pitch_um=6.5, diffuser_distance_mm=8.9)
 LOOSE = "axes = {x_um = {backlash = 200, scale = 1.05}, y_um = {backlash = 120}, z_um = {backlash = 200}}\n"
 
 
@@ -158,3 +164,23 @@ def test_an_axis_goes_below_a_place_only_where_it_must() -> None:
     assert approached(here, {"x_um": 0.0}, play, ["x_um"]) == [{"x_um": 0.0}]
     assert approached(here, {"x_um": -1.0}, play, ["x_um"]) == [{"x_um": -16.0}, {"x_um": -1.0}]
     assert approached(here, {"y_um": -5.0}, play) == [{"y_um": -5.0}]
+
+
+def test_the_way_along_z_on_a_large_sensor_is_read_from_larger_pixels(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    texture = ndimage.gaussian_filter(np.random.default_rng(3).random((800, 1000)), 5.0)
+    reference = ((texture - texture.min()) * 1e5).astype(np.float32)
+    z_um, d_um, gone_um = 60e3, 8.9e3, -300.0
+    larger = (1 + d_um / (z_um + gone_um)) / (1 + d_um / z_um)
+    image = moved(stage_play._resized(reference, larger), 0.7, -1.3)
+    asked: list[int] = []
+
+    def asked_of(seen: np.ndarray, other: np.ndarray) -> float:
+        asked.append(other.size)
+        return growth(seen, other)
+
+    monkeypatch.setattr(stage_play, "growth", asked_of)
+    record = StageRecord(z_um, 1000.0, 4, ("z_um",), {}, LARGE, {}, "", simulated=True)
+    assert stage_play._moved_um(image, reference, "z_um", record) == pytest.approx(gone_um, abs=2.0)
+    assert max(asked) <= LARGEST_PX < reference.size
