@@ -2,24 +2,39 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from math import prod
 from pathlib import Path
+from types import MappingProxyType
+
+import numpy as np
 
 from calibration_routines.procedure import Listener, Outlook
+from calibration_routines.scatter import reduction
 from instrument.bench.bench import Bench
 from instrument.plan import Plan, Step, estimate
 from instrument.runs.acquire import abilities_of
 from instrument.runs.pace import pace_of
 from instrument.runs.timed import TimedSteps
 
+_NOTHING: Mapping[str, tuple[float, float]] = MappingProxyType({})
+
 
 def outlook_of(
-    bench: Bench, plan: Plan, folder: Path | None, reasons: Sequence[str] = (), *, homes: bool = False
+    bench: Bench,
+    plan: Plan,
+    folder: Path | None,
+    reasons: Sequence[str] = (),
+    *,
+    homes: bool = False,
+    computes: Mapping[str, tuple[float, float]] = _NOTHING,
 ) -> Outlook:
     """Return the outlook of a plan that was checked.
 
     Where it moves a stage, the reasons say whether that is homed first: always (``homes``), or where it has
-    no reference yet.
+    no reference yet. ``computes`` has what its steps compute for each frame (:class:`Outlook`): for each of
+    its megapixels as they are compared (:func:`calibration_routines.scatter.reduction`), and for each at all.
+    Simulated light is part of it, so that it says nothing of a real bench.
     """
     abilities = abilities_of(bench, folder or bench.config.data_folder)
     path = path_of(plan)
@@ -31,7 +46,14 @@ def outlook_of(
     pace = pace_of(plan, abilities, folder or bench.config.data_folder, bench.config.text)
     if pace is not None:
         words.append(pace.words(plan, abilities))
-    return Outlook(tuple(words), plan, estimate(plan, abilities), abilities.free_bytes, path=path)
+    cost, shape = estimate(plan, abilities), bench.camera.frame_shape[:2]
+    compared = prod(shape) / reduction(np.broadcast_to(np.float32(0), shape)) ** 2
+    work = tuple(
+        (step, 1e-6 * cost.frames * (by_compared * compared + by_all * prod(shape)))
+        for step, (by_compared, by_all) in computes.items()
+        if bench.simulated_kinds
+    )
+    return Outlook(tuple(words), plan, cost, abilities.free_bytes, work=work, path=path)
 
 
 def path_of(plan: Plan) -> tuple[dict[str, float], ...]:

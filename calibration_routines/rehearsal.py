@@ -161,10 +161,11 @@ class _Watch(Listener):
             )
         most = "at most " if self._at_most else "about "
         end_s, computed_s = (seen + left for seen, left in zip(self._seen_s, self._left_s(), strict=True))
-        step, share = f'"{self._step}"', f"by a rehearsal up to {self._done / self._total:.0%} of"
+        step, share = f'"{self._step}"', f"by a rehearsal up to {max(0.01, self._done / self._total):.0%} of"
         if (following_s := self._following_s(computed_s)) is not None:
             whole = duration(end_s + following_s)
-            return f"{IN_ALL}{share} {step} and the sizes of what follows: {most}{whole}."
+            sizes = "" if self._step == self._work[-1][0] else " and the sizes of what follows"
+            return f"{IN_ALL}{share} {step}{sizes}: {most}{whole}."
         return f"Up to the end of {step}, {share} it: {most}{duration(end_s)}. What follows it comes on top."
 
     def _following_s(self, computed_s: float) -> float | None:

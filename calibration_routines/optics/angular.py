@@ -292,6 +292,10 @@ def _optics(geometry: Geometry) -> list[float]:
 
 
 # Procedure ---------------------------------------------------------------------------------------------
+_COMPUTES = {"moving the source": (4.4, 2.2), "analysing": (19.0, 1.7)}
+"""Transforms for each megapixel of a frame, compared and all (docs/benchmarks/time-told.md)."""
+
+
 @dataclass(frozen=True, slots=True)
 class AngularProcedure(Procedure):
     """Measure the sensor's angular response."""
@@ -312,7 +316,7 @@ class AngularProcedure(Procedure):
             reason += " (beyond, the pattern leaves the sensor)"
         given = self.sweep.z_um is not None
         farthest = "" if given else ", the farthest from which the stage spans the angles"
-        return outlook_of(bench, plan, folder, [reason + farthest])
+        return outlook_of(bench, plan, folder, [reason + farthest], computes=_COMPUTES)
 
     def perform(self, bench: Bench, folder: Path | None, control: RunControl, listener: Listener) -> Outcome:
         """Home, move the source, and save the response with its picture in the run's folder."""

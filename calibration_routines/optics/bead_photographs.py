@@ -42,6 +42,8 @@ BEADS_FOLDER = "calibration-beads"
 """Where the command line writes the calibration."""
 SLIDE_FILE = "beads.tif"
 """Of a photograph of a slide, in its run's folder: no scene to reconstruct."""
+SLIDE = "photographing bead slide"
+"""What the step of each begins with; its number follows."""
 _DARK_FRAMES = 4
 _TAKES, _SHORTER = 3, 0.7
 """Times that a slide which saturates is photographed, and the share of the exposure each time."""
@@ -328,7 +330,7 @@ class _Series:
             ask(f"Photograph {number + 1} of {self._slides.images}: move the bead slide somewhere else.")
 
     def _take(self, number: int, exposure_ms: float) -> Photograph:
-        self._listener.step(f"photographing bead slide {number + 1} of {self._slides.images}")
+        self._listener.step(f"{SLIDE} {number + 1} of {self._slides.images}")
         bench, before = self._bench, tuple(one.run.path.name for one in self.photographs)
         simulated = bool(bench.simulated_kinds)
         record = SlideRecord(self._slides, number, before, bench.geometry, bench.label, simulated)

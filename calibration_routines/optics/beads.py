@@ -6,6 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from importlib.metadata import version
+from math import prod
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +16,7 @@ import numpy.typing as npt
 from calibration_routines.optics.bead_photographs import (
     BEADS,
     BEADS_FOLDER,
+    SLIDE,
     BeadSlides,
     photograph_slides,
     show_slide_again,
@@ -185,6 +187,9 @@ def window_for(slides: BeadSlides, geometry: Geometry, shape: tuple[int, int]) -
     return min(window[0], shape[0]), min(window[1], shape[1])
 
 
+SLIDES, SOLVING = "photographing bead slides", "blind deconvolution"
+
+
 # Procedure -------------------------------------------------------------------------------------------
 @dataclass(frozen=True, slots=True)
 class BeadProcedure(Procedure):
@@ -202,12 +207,18 @@ class BeadProcedure(Procedure):
         geometry = binned(bench.geometry, slides.binning)
         frame = bench.camera.frame_shape[0] // slides.binning, bench.camera.frame_shape[1] // slides.binning
         frames = slides.images * (slides.average + 4)
+        light = kept_times.photographed_by(SLIDES, 1e-6 * prod(bench.camera.frame_shape[:2]))
+        work = (
+            (SLIDE, slides.images * light if bench.simulated_kinds else 0.0),
+            (SOLVING, kept_times.solved_by(SOLVING, 1e-6 * prod(frame))),
+        )
         return Outlook(
             (
                 f"{slides.images} photographs of {slides.average} frames, each with 4 dark frames: {frames} "
                 "frames; the slide is moved in between",
                 *psf_lines(slides, geometry, frame),
-            )
+            ),
+            work=work,
         )
 
     def perform(self, bench: Bench, folder: Path | None, control: RunControl, listener: Listener) -> Outcome:
@@ -226,10 +237,10 @@ def _photograph_and_solve(
     """Photograph the slides that are left after ``begun``, solve all, and save the calibration."""
     geometry = binned(bench.geometry, slides.binning)
     facts: dict[str, Any] = {"bench": bench.label, "simulated": bool(bench.simulated_kinds)}
-    listener.step("photographing bead slides")
+    listener.step(SLIDES)
     taken = photograph_slides(bench, slides, folder, control, listener, begun)
     kept_times.solving(taken.images[0].size / 1e6)
-    listener.step("blind deconvolution")
+    listener.step(SOLVING)
 
     def solving(_words: str, done: float) -> None:
         control.check()

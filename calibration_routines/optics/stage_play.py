@@ -379,6 +379,10 @@ def stage_lines(found: StagePlay) -> list[str]:
 
 
 # Procedure -------------------------------------------------------------------------------------------
+_COMPUTES = {"moving to and fro": (4.4, 2.2), "analysing": (33.7, 0.9)}
+"""Transforms for each megapixel of a frame, compared and all (docs/benchmarks/time-told.md)."""
+
+
 @dataclass(frozen=True, slots=True)
 class StageProcedure(Procedure):
     """Measure play, repeatability, scale and lost steps of the stage's axes."""
@@ -396,7 +400,7 @@ class StageProcedure(Procedure):
             f"{names} each go {record.reach_um:g} um to both sides of z = {record.z_um / 1e3:.4g} mm, "
             f"{self.asked.turns} times"
         )
-        return outlook_of(bench, plan, folder, [words])
+        return outlook_of(bench, plan, folder, [words], computes=_COMPUTES)
 
     def perform(self, bench: Bench, folder: Path | None, control: RunControl, listener: Listener) -> Outcome:
         """Home, move to and fro, and save what was found in the run's folder."""

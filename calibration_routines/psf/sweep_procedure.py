@@ -30,6 +30,9 @@ from instrument.bench.bench import Bench
 from instrument.runs.run import Run
 from instrument.runs.run_control import RunControl
 
+_COMPUTES = {"sweeping": (10.4, 4.8), "analysing": (14.3, 2.1)}
+"""Transforms for each megapixel of a frame, compared and all (docs/benchmarks/time-told.md)."""
+
 
 @dataclass(frozen=True, slots=True)
 class SweepProcedure(Procedure):
@@ -41,7 +44,9 @@ class SweepProcedure(Procedure):
         """Plan the sweep and hold it against the bench's limits and the disk."""
         planned = self.sweep.planned(bench)
         plan = check_sweep(bench, planned.sweep, folder or bench.config.data_folder)
-        outlook = outlook_of(bench, plan, folder, planned.reasons, homes=not planned.sweep.by_hand)
+        outlook = outlook_of(
+            bench, plan, folder, planned.reasons, homes=not planned.sweep.by_hand, computes=_COMPUTES
+        )
         caveat = (
             f"Seconds are for the camera's present {bench.camera.exposure_ms:g} ms; the exposures are found "
             "at the start."

@@ -112,6 +112,16 @@ def solving(megapixels: float) -> None:
     _solved_megapixels = megapixels
 
 
+def solved_by(step: str, megapixels: float) -> float:
+    """Return what a step that solves pictures of so many megapixels computes, in transforms."""
+    return _TRANSFORMS.get(step, 0.0) + _PER_SOLVED_MEGAPIXEL.get(step, 0.0) * megapixels
+
+
+def photographed_by(step: str, megapixels: float) -> float:
+    """Return what a simulated bench computes in a step whose light is not there yet, in transforms."""
+    return _TRANSFORMS_PER_MEGAPIXEL[step][0] * megapixels
+
+
 def place() -> Path:
     """Return the file, in the user's cache; it may be removed at any time."""
     return cache_folder() / "times.json"

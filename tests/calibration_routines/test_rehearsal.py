@@ -6,6 +6,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import pytest
 from numba.core import event
@@ -13,7 +14,7 @@ from numba.core import event
 from calibration_routines import rehearsal
 from calibration_routines.procedure import Listener, Outcome, Outlook, Procedure
 from calibration_routines.rehearsal import ENOUGH_S, rehearse_whole
-from calibration_routines.routine import Routine
+from calibration_routines.routine import Routine, routines
 from drivers.errors import DeviceError
 from instrument.bench.bench import Bench, open_bench
 from instrument.bench.config_file import parse_config
@@ -21,6 +22,7 @@ from instrument.files.errors import duration
 from instrument.runs.rehearsal import twin_of
 from instrument.runs.run_control import RunControl
 from instrument.runs.runner import RunState, RunStatus
+from tests.mocks.listeners import Following
 
 TINY = """
 [camera]
@@ -30,6 +32,14 @@ driver = "simulated"
 [simulated]
 preset = "tiny"
 time_scale = 1.0
+"""
+LIT = """
+[led_array]
+driver = "simulated"
+[source]
+rgb = [0, 255, 0]
+[scene]
+control = "simulated"
 """
 
 
@@ -228,3 +238,37 @@ def test_what_cannot_be_rehearsed_is_not_told(bench: Bench, tmp_path: Path) -> N
 
     assert told(fails, bench) == ()
     assert told(lambda *_: pytest.fail("It was carried out."), bench, Asked(again=tmp_path)) == ()
+
+
+@pytest.mark.parametrize(
+    ("name", "asked"),
+    [
+        ("axial", {"z_min_um": 80e3, "z_max_um": 120e3, "planes": 2}),
+        ("angular", {"z_um": 80e3, "largest_deg": 4.0, "step_deg": 2.0}),
+        ("stage", {"turns": 2}),
+    ],
+)
+def test_routines_that_move_the_source_tell_the_work_of_the_steps_that_they_take(
+    tmp_path: Path, name: str, asked: dict[str, Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    following = Following()
+    lit = TINY.replace("1.0", "0.0") + LIT
+    with open_bench(parse_config(lit, None)) as bench:
+        procedure = routines[name].asked(asked)
+        work = procedure.outlook(bench).work
+        procedure.carry_out(bench, tmp_path, listener=following)
+        monkeypatch.setattr(Bench, "simulated_kinds", ())
+        assert not procedure.outlook(bench).work  # it has simulated light
+    assert [step for step in following.steps if step in dict(work)] == [step for step, _ in work]
+    assert work[-1][0] == following.steps[-1] == "analysing"
+    assert all(transforms > 0 for _, transforms in work)
+
+
+def test_of_beads_solving_is_told_by_the_pixels_that_are_solved(bench: Bench) -> None:
+    work, less = (
+        dict(routines["beads"].asked({"binning": n, "z_um": 1e5}).outlook(bench).work) for n in (2, 4)
+    )
+    assert list(work) == ["photographing bead slide", "blind deconvolution"]
+    assert work["photographing bead slide"] == less["photographing bead slide"] > 0
+    assert work["blind deconvolution"] == pytest.approx(4380)  # measured 4613, and 1999 of the others
+    assert less["blind deconvolution"] == pytest.approx(2220)

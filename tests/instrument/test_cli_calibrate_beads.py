@@ -176,7 +176,7 @@ def test_a_dry_run_says_what_it_would_do_and_writes_nothing(
     assert "at z = 3.1 mm" in said  # where that bench has its slides
     assert "9 photographs of 4 frames" in said
     assert "take long to solve" in said
-    assert 'Up to the end of "photographing bead slide"' in said
+    assert 'of "photographing bead slide" and the sizes of what follows' in said
     assert not (tmp_path / "runs").exists()
     assert not Path(out).exists()
 
