@@ -6,8 +6,9 @@
     python benchmarks/growth.py --explained       # what --explain says of each kind, and what all of it takes
 
 Cases run in processes of their own on points seen through random lenslets (SIMULATED): first the
-forecast that ``--explain`` gives, then the whole of it; frames and workers are those of films, by the clock
-where there are several; holograms are those of a picture through a scattering mask. Written are
+forecast that ``--explain`` gives, then the whole of it; frames and workers are those of films; holograms are
+those of a picture through a scattering mask. Seconds are of the processor, of several threads by the clock,
+and of workers what this program takes and what each of them does: nothing waits for a core. Written are
 ``growth.png`` and ``growth.csv``: seconds and memory against each size, the exponent by which they grow, what
 the forecast missed, and the largest that fits into this machine's memory, straight on from the last two.
 Sizes are scaled by ``--most``.
@@ -25,15 +26,18 @@ import sys
 import threading
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+from benchmarks.growth_kinds import KINDS, made_of
 from instrument.display.hologram import compute_and_judge
 from instrument.display.hologram_forecast import forecast_hologram
 from instrument.files import kept_times
@@ -41,6 +45,7 @@ from instrument.files.figures import ACCENT, INK, SECOND, save_figure, style
 from instrument.files.images import write_image
 from instrument.files.sample_images import load_sample
 from instrument.reconstruction import forecast as module
+from instrument.reconstruction import video_forecast, video_work
 from instrument.reconstruction.forecast import forecast
 from instrument.reconstruction.foretold import Foretold, Like
 from instrument.reconstruction.options import InputOptions, VideoOptions
@@ -48,9 +53,7 @@ from instrument.reconstruction.video import VideoRequest, finish_video, prepare_
 from instrument.reconstruction.video_forecast import forecast_video, trial_of
 from instrument.reconstruction.video_work import BlockReport
 from recon import Calibration, Geometry, reconstruct
-from recon.base.blocks import block_mean
 from recon.base.threads import set_threads
-from recon.evaluation.measured_sets import MEASURED, measured_set
 from recon.evaluation.scene import make_scene
 from recon.holography import Display, HologramOptions, Target, random_mask
 from recon.reconstruction.measurement import Measurement
@@ -58,6 +61,11 @@ from recon.reconstruction.options import ReconstructionOptions
 from recon.solvers.memory import GIB, MemoryMeter, available_bytes
 from recon.streams.joint import OverTimeName
 from tests.mocks.recordings import write_recording
+
+BY_PROCESSOR = "GROWTH_BY_PROCESSOR"
+"""In the environment of workers, which read this file as they begin, and count the processor's seconds."""
+if os.environ.get(BY_PROCESSOR):
+    video_work.time = SimpleNamespace(perf_counter=time.process_time)
 
 
 @dataclass(frozen=True)
@@ -146,10 +154,31 @@ def measure(case: Case, iterations: int, foretold: bool, answer: Any) -> None:
     answer.send((time.perf_counter() - began, meter.peak_mib() * 2**20))
 
 
+def processor_of(workers: int) -> Callable[[], float]:
+    """Return what tells the processor's seconds of this program and of each of its workers to come."""
+    import psutil
+
+    own = psutil.Process()
+    os.environ[BY_PROCESSOR] = "1"
+
+    def seconds() -> float:
+        used = own.cpu_times()
+        theirs = used.children_user + used.children_system
+        for child in own.children():
+            with suppress(psutil.NoSuchProcess):
+                theirs += sum(child.cpu_times()[:2])
+        return float(used.user + used.system + theirs / workers)
+
+    return seconds
+
+
 def film(case: Case, foretold: bool, answer: Any) -> None:
-    """Forecast a film, or make it; sends seconds (of the processor where one thread does all) and bytes."""
-    if case.threads == 1 and not case.workers:
-        time.perf_counter = time.process_time
+    """Forecast a film, or make it; sends seconds of the processor, and bytes."""
+    clock = processor_of(case.workers) if case.workers else time.process_time
+    if case.workers:
+        video_forecast.time = SimpleNamespace(perf_counter=clock)
+    else:
+        time.perf_counter = clock
     set_threads(case.threads)
     with TemporaryDirectory() as scratch:
         folder = Path(scratch)
@@ -164,9 +193,9 @@ def film(case: Case, foretold: bool, answer: Any) -> None:
             assert told is not None
             answer.send((told.seconds, *told.between_bytes))
             return
-        meter, began = MemoryMeter(), time.perf_counter()
+        meter, began = MemoryMeter(), clock()
         reports = make_film(asked)
-        took_s = time.perf_counter() - began
+        took_s = clock() - began
         own = max(report.peak_bytes for report in reports)
         answer.send((took_s, own if case.workers else meter.peak_mib() * 2**20))
 
@@ -275,58 +304,6 @@ def tell_default(size: int) -> None:
                     f"early {foretold.memory_bytes / max(took_bytes, 1) - 1:+.0%})",
                     flush=True,
                 )
-
-
-KINDS: dict[str, tuple[str, dict[str, Any], dict[str, Any]]] = {
-    "picture": ("dense-picture", {"size": 128}, {}),
-    "picture, l1": ("dense-picture", {"size": 128}, {"prior": "l1"}),
-    "sparse": ("sparse-picture", {"size": 128}, {}),
-    "sparse, l1": ("sparse-picture", {"size": 128}, {"prior": "l1"}),
-    "colour": ("dense-picture", {"size": 128, "channels": 3, "colourful": True}, {}),
-    "text": ("text", {"size": 192}, {}),
-    "9 PSFs, local": ("dense-picture", {"size": 96, "grid": 3, "aberration": 0.5}, {"model": "local"}),
-    "9 PSFs, lowrank": ("dense-picture", {"size": 96, "grid": 3, "aberration": 0.5}, {"model": "lowrank"}),
-    "9 PSFs, auto": ("sparse-picture", {"size": 96, "grid": 3, "aberration": 0.5}, {}),
-    "beads": ("beads", {"size": 96}, {}),
-    "beads, l1": ("beads", {"size": 96}, {"prior": "l1"}),
-    "volume": ("dense-volume", {"size": 96}, {}),
-    "volume, 9 PSFs": ("microscope", {"size": 64, "grid": 3}, {}),
-    "hand": ("hand", {"binning": 4}, {}),
-    "hand, l1": ("hand", {"binning": 4}, {"prior": "l1"}),
-    "hand, small": ("hand", {"binning": 8}, {}),
-    "USAF, 9 planes": ("usaf", {"binning": 2, "every": 5}, {}),
-    "USAF, 32 planes": ("usaf", {"binning": 2, "first": 32}, {}),
-    "USAF, 44, l1": ("usaf", {"binning": 2}, {"prior": "l1"}),
-    "hand, large": ("hand", {"binning": 2}, {}),
-    "USAF, large": ("usaf", {"binning": 1, "every": 4}, {}),
-    "texture": ("texture", {"size": 160}, {}),
-    "filaments": ("filaments", {"size": 160}, {}),
-    "lights": ("lights", {"size": 160}, {}),
-    "gradient, l1": ("gradient", {"size": 160}, {"prior": "l1"}),
-    "9 PSFs, large": ("filaments", {"size": 192, "grid": 3, "aberration": 0.5}, {"model": "local"}),
-    "colour, 9 PSFs": (
-        "dense-picture",
-        {"size": 128, "channels": 3, "colourful": True, "grid": 3, "aberration": 0.5},
-        {"model": "local"},
-    ),
-    "volume, lowrank": ("microscope", {"size": 64, "grid": 3}, {"model": "lowrank"}),
-    "volume, colour": ("dense-volume", {"size": 64, "channels": 3}, {}),
-    "volume, large": ("dense-volume", {"size": 192}, {}),
-    "beads, large": ("beads", {"size": 192}, {}),
-}
-"""Scenes by family, sizes and options, whose reconstructions are explained; some are measured sets."""
-
-
-def made_of(family: str, seed: int, **sizes: Any) -> tuple[np.ndarray, Calibration]:
-    """Return photograph and calibration of a scene, or of a measured set: binned, and some of its depths."""
-    if family not in MEASURED:
-        scene = make_scene(family, seed=seed, **sizes)  # type: ignore[arg-type]
-        return scene.measurement, scene.calibration
-    psfs, photograph = (block_mean(a, sizes["binning"]) for a in measured_set(family))
-    psfs = psfs[: sizes.get("first")][:: sizes.get("every", 1)]
-    positions = np.zeros((len(psfs), 3))
-    positions[:, 2] = np.arange(1.0, len(psfs) + 1)
-    return photograph, Calibration(psfs[:, None], positions)
 
 
 def explain_or_take(kind: str, seed: int, foretold: bool, by_course: bool, answer: Any) -> None:
