@@ -28,7 +28,7 @@ sys.path.append(str(Path(__file__).parents[1]))
 from gui_stalls import Turns
 from PySide6.QtCore import QSize
 
-from gui.app import application
+from gui.app import application, go_first
 from gui.theme import apply_theme
 from tests.gui.day import STEPS, Operator
 from tests.gui.looks import SIZES
@@ -47,6 +47,7 @@ def main() -> int:
     parser.add_argument("--pictures", action="store_true", help="keep one after every step, in the folder")
     given = parser.parse_args()
     sizes = {text: QSize(*map(int, text.split("x"))) for text in given.size or ()} or SIZES
+    go_first()
     apply_theme(application(), "dark")
     failed = 0
     spent = given.folder or Path(tempfile.mkdtemp())

@@ -40,13 +40,11 @@ import numpy as np
 from PySide6.QtCore import QSettings, Qt
 from PySide6.QtTest import QTest
 
-from tests.gui.event_loop import let_work, wait_until
-
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from benchmarks.gui_stalls import Turns
 from drivers.simulated.led_array import SimulatedLedArray
-from gui.app import application
+from gui.app import application, go_first
 from gui.main_window import MainWindow
 from gui.panels.led_array import LedPanel
 from gui.panels.live import LivePanel
@@ -60,6 +58,7 @@ from instrument.files.calibration_file import save_calibration
 from instrument.plan.model import load_plan
 from instrument.runs.acquire import prepare
 from recon.types import Calibration
+from tests.gui.event_loop import let_work, wait_until
 
 BENCH = """
 [bench]
@@ -125,6 +124,7 @@ def main() -> int:
     parser.add_argument("--seed", type=int, default=0, help="of what is done when")
     arguments = parser.parse_args()
     app = application()
+    go_first()
     apply_theme(app, "dark")
     with tempfile.TemporaryDirectory() as folder:
         soak = Soak(Path(folder), np.random.default_rng(arguments.seed))

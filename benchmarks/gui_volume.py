@@ -32,7 +32,6 @@ from instrument.reconstruction.stored_result import export_result, open_result
 from tests.gui.event_loop import let_work, wait_until
 
 TICK_MS = 5
-WAIT_S = 300.0
 TURNS = 90
 
 

@@ -62,6 +62,7 @@ def working_folder() -> Path:
 def _shown(app: QApplication, config: BenchConfig, settings: QSettings) -> tuple[int, BenchConfig | None]:
     """Show the window for a bench until it is closed; returns the exit status, and which bench is next."""
     status = 0
+    go_first()
     apply_theme(app, theme_of(settings))  # which the window before may have changed
     session = BenchSession(config)
     sys.excepthook = _ToLog(session)
@@ -97,10 +98,14 @@ def _shown(app: QApplication, config: BenchConfig, settings: QSettings) -> tuple
     return status, window.next_bench
 
 
-def show_and_open(window: MainWindow) -> None:
-    """Show a window, and open its bench when it was seen: what takes long is done before there is light."""
+def go_first() -> None:
+    """Have the window's thread, the main one, answer before those that compute, for good."""
     sys.setswitchinterval(HANDOVER_S)
     stand_back()
+
+
+def show_and_open(window: MainWindow) -> None:
+    """Show a window, and open its bench when it was seen: what takes long is done before there is light."""
     load = extensions_put_off()  # before panels are prepared, which begins with the first events
     application().processEvents()  # to be made and to be shown are turns of their own
     window.show()

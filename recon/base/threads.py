@@ -44,39 +44,27 @@ def set_threads(threads: int) -> None:
 def stand_back() -> None:
     """Have threads that compute in blocks let the main one go first from now on; on Linux, elsewhere nothing.
 
-    For a window: its thread is to answer while they have every core. What stands back does so for good: only
-    an administrator may raise what was lowered.
+    For a window: its thread is to answer while they have every core. They compute for whoever asks, who waits
+    and keeps its priority: what it begins, a camera's stream or a program, would inherit a lower one, which
+    only an administrator may raise.
     """
     global _stands_back
     _stands_back = sys.platform == "linux"
-
-
-def _let_main_go_first() -> None:
-    if not _stands_back or getattr(_inside, "back", False):
-        return
-    _inside.back = True
-    own, main = threading.get_native_id(), os.getpid()
-    if own == main:
-        return
-    with suppress(OSError):  # where a sandbox has no priorities, all stay equal
-        least = os.getpriority(os.PRIO_PROCESS, main) + _STEP_BACK
-        if os.getpriority(os.PRIO_PROCESS, own) < least:  # a thread begins with what its maker has
-            os.setpriority(os.PRIO_PROCESS, own, least)
+    _pool.cache_clear()
 
 
 @lru_cache(maxsize=1)
 def _pool(threads: int) -> ThreadPoolExecutor:
-    return ThreadPoolExecutor(threads, thread_name_prefix="recon", initializer=_join_pool)
+    return ThreadPoolExecutor(threads, thread_name_prefix="recon", initializer=one_of_several)
 
 
-def _join_pool() -> None:
-    stay_alone()
-    _let_main_go_first()
-
-
-def stay_alone() -> None:
-    """Have this thread share nothing from now on: it is one of several that work already."""
+def one_of_several() -> None:
+    """Have this thread share nothing from now on, as several work already, and stand back where they do."""
     _inside.pool = True
+    if _stands_back:
+        with suppress(OSError):  # where a sandbox has no priorities, all stay equal
+            least = os.getpriority(os.PRIO_PROCESS, os.getpid()) + _STEP_BACK
+            os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), least)
 
 
 def threads_here() -> int:
@@ -103,7 +91,6 @@ def in_blocks(kernel: Callable[[int, int], object], length: int, *, grain: int =
     grain : int
         Smallest block worth a thread.
     """
-    _let_main_go_first()
     blocks = min(_threads, max(length // max(grain, 1), 1))
     if blocks <= 1 or getattr(_inside, "pool", False):
         kernel(0, length)
@@ -111,8 +98,10 @@ def in_blocks(kernel: Callable[[int, int], object], length: int, *, grain: int =
     edges = [length * i // blocks for i in range(blocks + 1)]
     with _lock:
         pool = _pool(_threads)
-    others = [pool.submit(kernel, edges[i], edges[i + 1]) for i in range(1, blocks)]
-    kernel(edges[0], edges[1])
+    own = 0 if _stands_back else 1
+    others = [pool.submit(kernel, edges[i], edges[i + 1]) for i in range(own, blocks)]
+    if own:
+        kernel(edges[0], edges[1])
     for other in others:
         other.result()
 

@@ -19,7 +19,7 @@ import numpy as np
 import numpy.typing as npt
 
 from recon.base.fft import fast_shape, irfft_strip, multiply, rfft_strip, spectrum_shape
-from recon.base.threads import get_threads, stay_alone
+from recon.base.threads import get_threads, one_of_several
 from recon.optics.fall_off import FallOff, response_on
 from recon.optics.grid import FloatArray, PixelGrid, mixed_spectrum
 from recon.optics.scene import Layer, Scene
@@ -96,7 +96,7 @@ def render(
         light *= response_on(grid, source, propagator.distance_um, fall_off)
         return light
 
-    with ThreadPoolExecutor(get_threads(), "render", stay_alone) as pool:
+    with ThreadPoolExecutor(get_threads(), "render", one_of_several) as pool:
         for light in pool.map(bead, scene.points()):
             if light is not None:
                 image += np.float32(bead_photons) * light
@@ -166,7 +166,7 @@ class _LayerRenderer:
             nodes_y, nodes_x = self._nodes()
             self.flux *= self._vignetting_ratio(nodes_y, nodes_x)
             indices = itertools.product(range(len(nodes_y)), range(len(nodes_x)))
-            with ThreadPoolExecutor(get_threads(), "render", stay_alone) as pool:
+            with ThreadPoolExecutor(get_threads(), "render", one_of_several) as pool:
                 # Added up in their order, whoever is done first: the sum is the same to the last bit.
                 for part in pool.map(lambda at: self._node(nodes_y, at[0], nodes_x, at[1]), indices):
                     if part is not None:

@@ -7,6 +7,7 @@ import os
 import signal
 import subprocess
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +19,16 @@ from gui import app
 from gui.main_window import MainWindow
 from gui.widgets.dialogues import TextWindow
 from instrument.cli import main
+
+
+@pytest.fixture(autouse=True)
+def standing_back(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[bool]]:
+    """Whether threads were asked to stand back, which they do for good: not in the tests' process."""
+    asked: list[bool] = []
+    monkeypatch.setattr(app, "stand_back", lambda: asked.append(True))
+    usual_s = sys.getswitchinterval()
+    yield asked
+    sys.setswitchinterval(usual_s)
 
 
 def test_help_has_examples(capsys: pytest.CaptureFixture[str]) -> None:
@@ -107,7 +118,7 @@ def test_without_a_screen_it_says_so(
 
 @pytest.mark.usefixtures("qapp")
 def test_ctrl_c_while_the_window_is_made_ends_it(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, bench_text: str
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, bench_text: str, standing_back: list[bool]
 ) -> None:
     for scope in (QSettings.Scope.UserScope, QSettings.Scope.SystemScope):
         QSettings.setPath(QSettings.Format.NativeFormat, scope, str(tmp_path / "settings"))
@@ -125,12 +136,9 @@ def test_ctrl_c_while_the_window_is_made_ends_it(
         window.deleteLater()
 
     monkeypatch.setattr(app, "show_and_open", interrupted)
-    usual_s = sys.getswitchinterval()
-    try:
-        assert main(["gui", str(tmp_path / "bench.toml")]) == 0
-        assert sys.getswitchinterval() == pytest.approx(0.001), "a click waits for no thread longer (0296)"
-    finally:
-        sys.setswitchinterval(usual_s)
+    assert main(["gui", str(tmp_path / "bench.toml")]) == 0
+    assert sys.getswitchinterval() == pytest.approx(0.001), "a click waits for no thread longer (0296)"
+    assert standing_back, "nor for those that compute (0301)"
     assert ends.isActive()  # nothing had to end it
 
 
