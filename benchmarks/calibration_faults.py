@@ -265,7 +265,7 @@ def _tenths(found: Array, usual: Array) -> float:
 
 
 def _beads(bench: Bench, folder: Path) -> tuple[Array, list[str], bool]:
-    taken = photograph_slides(bench, BeadSlides(z_um=80e3, images=3), folder, RunControl(), Listener())
+    taken = photograph_slides(bench, BeadSlides(images=3), folder, RunControl(), Listener())
     return taken.images, list(taken.findings), not taken.findings
 
 
@@ -295,7 +295,10 @@ for _key, _value in {
     _DISPLAY = re.sub(rf"(?m)^{_key} = [^#\n]*", f"{_key} = {_value} ", _DISPLAY)
 _LEARNED = configuration("errors", expansion=4, seed=0).replace("[slm]\n", "[slm]\nsettle_ms = 1000.0\n")
 _SPOTS = {"reach": 8.0, "depth_um": 100.0, "spots": 25, "refinements": 2, "section_pictures": 2}
-_SLIDE = 'scene = "beads"\nscene_distance_mm = 80.0\nbeads = 20\n'
+_SLIDE = 'scene = "beads"\nbeads = {}\n'
+_MICROSCOPE = TINY.replace('driver = "simulated"', 'driver = "simulated"\nbinning = 4', 1).replace(
+    'preset = "tiny"', 'preset = "microscope"'
+)
 _NEAR = {"z_min_um": 60e3, "z_max_um": 150e3}
 TRIALS = {
     "axial": Trial(TINY, _routine("axial", _psfs, **_NEAR, planes=7, reference_every=3), _of_psfs),
@@ -323,7 +326,8 @@ TRIALS = {
         TINY, _routine("angular", _response, largest_deg=9.0, step_deg=3.0, z_um=80e3), _largest
     ),
     "field": Trial(TINY, _field, _largest),
-    "beads": Trial(TINY + 'scene = "beads"\nscene_distance_mm = 80.0\nbeads = 20\n', _beads, _of_slides),
+    "beads": Trial(TINY + _SLIDE.format(20) + "scene_distance_mm = 80.0\n", _beads, _of_slides),
+    "microscope": Trial(_MICROSCOPE + _SLIDE.format(6), _beads, _of_slides),
     "photograph": Trial(TINY, _routine("photograph", _picture), _but_for_brightness),
     "stage": Trial(TINY, _routine("stage", _play), _of_play),
     "screen": Trial(
