@@ -93,8 +93,8 @@ class DarkModel:
         """Pixels that are bright without light at the longer exposure, in any frame: some blink, some turn
         hot meanwhile."""
         self.late_hot = 0
-        """Pixels among them that were not half as bright in the first dark frames: warm ones, which noise
-        takes beyond what is hot now and then, did not turn."""
+        """Pixels among them that stand above the others twice as far as in the first dark frames: warm ones,
+        which noise takes beyond what is hot now and then, did not turn."""
         self.variance = float("nan")
         """Of a pixel from frame to frame in the dark, counts squared; nan of a single frame."""
         if len(some := stack[:first, :: max(1, stack[0].size // _NOISE_PX)]) > 1:
@@ -103,8 +103,10 @@ class DarkModel:
         self.brightening_per_ms = 0.0
         """Counts a millisecond by which the last dark frames are brighter than the first, in the median."""
         if first < len(stack):
-            late = hot_pixels(np.max(stack[first:], axis=0), full_scale)
-            self.late_hot = int(np.count_nonzero(late & ~hot_pixels(before, full_scale, 0.5)))
+            after = np.max(stack[first:], axis=0)
+            late = hot_pixels(after, full_scale)
+            twice = after - float(np.median(after)) > 2 * (before - float(np.median(before)))
+            self.late_hot = int(np.count_nonzero(late & twice))
             self.hot |= late
             more = float(np.median(_mean(stack[first:]) - _mean(stack[:first])))
             self.brightening_per_ms = more / self._exposures_ms[longest]

@@ -127,18 +127,17 @@ class AutoExposure:
         return f"Auto-exposure {self.outcome.value}: {found}.{advice}"
 
 
-def hot_pixels(dark: Counts, full_scale: int, part: float = 1.0) -> npt.NDArray[np.bool_]:
+def hot_pixels(dark: Counts, full_scale: int) -> npt.NDArray[np.bool_]:
     """Find the pixels that are bright without light.
 
     A pixel is hot when it stands above the dark frame's median by more than 8 standard deviations of its
     noise (estimated robustly from the median absolute deviation) and by more than 1 % of full scale, the
-    largest count the camera can report; ``part`` of both is asked. ``dark``, (height, width) or (height,
-    width, 3), was taken with about the exposure that will be used, as dark current grows with it. Returns a
-    mask of its shape.
+    largest count the camera can report. ``dark``, (height, width) or (height, width, 3), was taken with about
+    the exposure that will be used, as dark current grows with it. Returns a mask of its shape.
     """
     median = float(np.median(dark))
     sigma = 1.4826 * float(np.median(np.abs(dark.astype(np.float32) - median)))
-    return dark > median + part * max(8.0 * sigma, 0.01 * full_scale)
+    return dark > median + max(8.0 * sigma, 0.01 * full_scale)
 
 
 def auto_expose(
