@@ -10,19 +10,15 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
+_COMPUTING = ("render", "recon")
+"""How names begin of threads that light is shared among: the renderer's own, and the pool for blocks."""
 
-def _threads() -> set[Path]:
-    """Return this program's threads as the system lists them; none on other systems than Linux."""
+
+def _computed_s(thread: threading.Thread) -> float:
+    """Return the seconds of the processor a thread has taken; 0 where it is over or a system does not say."""
     try:
-        return set(Path("/proc/self/task").iterdir())
+        said = Path(f"/proc/self/task/{thread.native_id}/stat").read_text()
     except OSError:
-        return set()
-
-
-def _computed_s(thread: Path) -> float:
-    try:
-        said = (thread / "stat").read_text()
-    except OSError:  # over
         return 0.0
     return sum(map(int, said.rpartition(")")[2].split()[11:13])) / os.sysconf("SC_CLK_TCK")
 
@@ -41,7 +37,8 @@ class Look:
         self._seen: npt.NDArray[np.float32] | None = None
         self._error: Exception | None = None
         self._over = threading.Event()
-        self._others = _threads()
+        self._spent_s: dict[threading.Thread, float] = {}
+        self._before_s = sum(self._so_far_s().values())
         self.thread = threading.Thread(target=self._run, name="simulated light", daemon=True)
         self.thread.start()
 
@@ -53,15 +50,22 @@ class Look:
         finally:
             self._over.set()
 
-    def computed_s(self) -> float:
-        """Return how long its thread and those that began since have computed, seconds of the processor.
+    def _so_far_s(self) -> dict[threading.Thread, float]:
+        """Return what each thread that ever shared light has computed, ended ones too."""
+        for thread in threading.enumerate():
+            if thread.name.startswith(_COMPUTING):
+                self._spent_s[thread] = max(_computed_s(thread), self._spent_s.get(thread, 0.0))
+        return self._spent_s
 
-        Light of many beads is shared among threads, which its own then waits for. 0 where it is over, and
-        where a system does not say.
+    def computed_s(self) -> float:
+        """Return how long its thread, and others that light is shared among, have computed since it began.
+
+        Seconds of the processor. Light of many beads is shared among threads, which its own waits for; the
+        pool for blocks may work for others meanwhile. 0 where it is over, or a system does not say.
         """
         if not self.thread.is_alive():
             return 0.0
-        return sum(_computed_s(thread) for thread in _threads() - self._others)
+        return _computed_s(self.thread) + sum(self._so_far_s().values()) - self._before_s
 
     def give_up(self) -> None:
         """Let go of who waits; what is being computed is kept by the world."""

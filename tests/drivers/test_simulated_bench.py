@@ -332,10 +332,13 @@ def test_what_a_light_takes_of_the_processor_is_told_and_waiting_is_none(
     waits, ends = threading.Event(), threading.Event()
     see = bench.world.photons_per_s
 
-    def busy_then_waiting(weights: Rgb, binning: int = 1) -> object:
+    def busy() -> None:
         until_s = time.thread_time() + 0.05
         while time.thread_time() < until_s:
             pass
+
+    def busy_then_waiting(weights: Rgb, binning: int = 1) -> object:
+        busy()
         waits.set()
         assert ends.wait(20.0)
         return see(weights, binning)
@@ -343,7 +346,7 @@ def test_what_a_light_takes_of_the_processor_is_told_and_waiting_is_none(
     def seen(weights: Rgb, binning: int = 1) -> object:
         if not shared:
             return busy_then_waiting(weights, binning)
-        with ThreadPoolExecutor(1) as pool:  # as beads are rendered
+        with ThreadPoolExecutor(1, "render") as pool:  # as beads are
             return pool.submit(busy_then_waiting, weights, binning).result()
 
     monkeypatch.setattr(bench.world, "photons_per_s", seen)
@@ -352,7 +355,9 @@ def test_what_a_light_takes_of_the_processor_is_told_and_waiting_is_none(
     assert waits.wait(20.0)
     time.sleep(0.05)
     computed_s = bench.camera.computed_s()
-    time.sleep(0.1)
+    other = threading.Thread(target=busy)  # as a window's
+    other.start()
+    other.join()
     assert bench.camera.computed_s() == computed_s > 0
     ends.set()
     bench.camera.stop_sequence()
