@@ -77,6 +77,8 @@ def hologram(
         raise BenchError(f"{target[0]} and --spots exclude each other: give a picture, or --spots.")
     if inputs.spots is None and not target:
         raise BenchError("Give a picture (diffuserbench hologram picture.png), or --spots 10x10.")
+    if target and len(target) > 1 and "out" not in given and not target[-1].exists():
+        raise BenchError(f"{target[-1]}: there is no such picture. Did you mean --out {target[-1]}?")
     config = load_and_say(bench)
     if inputs.spots is not None:
         given.refuse("--spots", "spots")

@@ -418,6 +418,7 @@ def test_an_existing_file_is_spared_and_quality_ends_the_work(capsys):
     ("arguments", "words"),
     [
         (["nowhere.png"], "no such file"),
+        (["picture.png", "pattern.png"], "no such picture. Did you mean --out pattern.png?"),
         (["picture.png", "--expansion", "5"], "must be a square"),
         (["picture.png", "--out", "slm.tif"], "written as .png"),
         (["picture.png", "--complex"], "written as .npy"),
