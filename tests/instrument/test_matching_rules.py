@@ -21,7 +21,7 @@ from instrument.reconstruction.matching import (
     matched_dark,
     whole_binnings,
 )
-from instrument.reconstruction.preparation import Dark, bin_image
+from instrument.reconstruction.preparation import Dark, bin_image, dark_level
 from recon.types import Calibration
 
 RNG = np.random.default_rng(2)
@@ -97,9 +97,22 @@ def test_a_calibrations_colours_become_their_mean_with_its_background(background
         np.testing.assert_allclose(found.background, background.mean(axis=0)[None], rtol=1e-6)
 
 
+@pytest.mark.parametrize(
+    ("channels", "photograph", "mosaic"),
+    [(3, (6, 9, 3), False), (3, (6, 9), True), (1, (6, 9), False), (1, (6, 9, 3), False)],
+)
+def test_where_there_is_nothing_to_mix_a_calibration_stays(
+    channels: int, photograph: tuple[int, ...], *, mosaic: bool
+) -> None:
+    given = Calibration(RNG.random((2, channels, 6, 9)), np.full((2, 3), np.nan))
+    found, words = matched_calibration(given, image(*photograph), mosaic=mosaic)
+    assert found is given
+    assert words == ""
+
+
 def dark(psf: ImageFile, photograph: ImageFile, level: Any, **how: bool) -> Dark:
     pair = matched(psf, photograph, mosaic=False)
-    choice = level if isinstance(level, float) else file(level, "dark.tif")
+    choice = level if isinstance(level, float | str) else file(level, "dark.tif")
     return matched_dark(choice, psf, photograph, pair, **how)
 
 
@@ -136,3 +149,22 @@ def test_a_frame_of_the_photograph_alone_leaves_the_psf_the_level_of_its_own_cor
     assert found.reason.endswith("from the image, 70 from the PSF (its upper right corner)")
     if psf != photograph:
         assert dark(file(pixels), image(*photograph), frame).reason == found.reason
+
+
+@pytest.mark.parametrize("colours", [(), (3,)])
+@pytest.mark.parametrize("times", [1, 2])
+def test_light_that_grows_across_a_psf_is_taken_off_where_it_is_binned_and_mixed(
+    colours: tuple[int, ...], times: int
+) -> None:
+    x = np.linspace(100, 900, 80).reshape(80, *[1 for _ in colours])
+    pixels = np.broadcast_to(x, (60, 80, *colours)) * np.array([1, 0.7, 1.2])[: 3 if colours else 1]
+    pixels = pixels + RNG.normal(size=pixels.shape)
+    y = np.arange(60)[:, None] - 30.0
+    spot = 2e4 * np.exp(-(y**2 + (np.arange(80) - 40.0) ** 2) / 18)
+    psf = file((pixels + spot.reshape(60, 80, *[1 for _ in colours])).astype(np.uint16))
+    photograph = image(60 // times, 80 // times)
+    whole = dark_level("auto", psf, photograph).psf
+    assert isinstance(whole, np.ndarray)
+    assert whole.shape == (60, 80, *colours)
+    grey = whole.mean(axis=-1) if colours else whole
+    np.testing.assert_allclose(dark(psf, photograph, "auto").psf, bin_image(grey, times), rtol=1e-5)
