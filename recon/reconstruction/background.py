@@ -489,13 +489,12 @@ def _left2(channel: Problem, offset: float) -> float:
 def _small(problem: Problem, channel: int, factor: int) -> Problem:
     """Return a channel on blocks of so many pixels a side."""
     own = slice(channel, channel + 1)
-    psfs = problem.calibration.psfs
-    calibration = problem.calibration
-    if psfs.shape[1] > 1:
-        calibration = replace(calibration, psfs=psfs[:, own])
+    calibration = replace(problem.calibration, background=None)
+    if calibration.psfs.shape[1] > 1:
+        calibration = replace(calibration, psfs=calibration.psfs[:, own])
     counts = problem.data[own] * problem.noise[channel]
     return Problem.of(
         on_blocks(counts, problem.valid[own], None, factor, flat=True),
-        reduced_calibration(replace(calibration, background=None), factor, None),
+        reduced_calibration(calibration, factor, None),
         ReconstructionOptions(model="convolution", estimate_background=False),
     )

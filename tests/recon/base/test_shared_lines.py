@@ -320,3 +320,30 @@ def test_the_measured_pairs_have_none_whatever_their_psf(binning: int) -> None:
         psf = np.ones(counts.data.shape[1:])  # lets nothing fine through: the photographs alone decide
         for data, valid, noise in zip(counts.data, counts.valid, noises, strict=True):
             assert shared_lines(data, valid, float(noise), psf) is None
+
+
+@pytest.mark.parametrize("count", [2, 3, 5, 9])
+def test_light_may_have_come_through_the_first_depth_or_the_last(count: int) -> None:
+    rng = np.random.default_rng(5)
+    psfs = rng.random((count, 9, 7)) ** 6
+    rows = np.arange(30)
+    for psf in (psfs[0], psfs[-1]):
+        means = module._cast(psf.sum(axis=1), rows) @ (rng.random(38) * (rng.random(38) > 0.7))
+        left = module._left_by_light(means, rows, psfs)
+        assert left is not None
+        assert np.linalg.norm(left) < 1e-6 * np.linalg.norm(means)
+
+
+def test_no_less_noise_is_taken_than_rounding_makes(monkeypatch: pytest.MonkeyPatch) -> None:
+    taken: list[float] = []
+
+    def offsets(image: Image, _valid: object, noise: float, _psfs: object) -> Image:
+        taken.append(noise)
+        return np.zeros(len(image), np.float32)
+
+    monkeypatch.setattr(module, "_offsets", offsets)
+    counts = 6.0 * np.random.default_rng(1).integers(0, 99, SHAPE)
+    for noise in (0.1, 7.0):
+        assert shared_lines(counts, np.ones(SHAPE, bool), noise, broad_psf()) is None
+    uniform = np.random.default_rng(2).uniform(-3, 3, 100_000).std()
+    assert taken == [pytest.approx(uniform, rel=0.01), pytest.approx(uniform, rel=0.01), 7, 7]
