@@ -105,6 +105,32 @@ def test_a_restart_gives_up_what_solvers_hold_and_before_the_first_frame_does_no
     assert solver.solvers == [None]
 
 
+def test_a_restart_forgets_that_a_picture_was_settled_or_followed_another() -> None:
+    reconstructor = live(budget_ms=AMPLE_MS)
+    reconstructor.feed(photograph(0, 0))
+    reconstructor._follows = reconstructor._greeted = reconstructor._settled = True
+    reconstructor.restart()
+    assert [reconstructor._follows, reconstructor._greeted, reconstructor._settled] == [False] * 3
+
+
+def test_all_depths_of_the_calibration_compete_for_a_frame(monkeypatch: pytest.MonkeyPatch) -> None:
+    asked: list[tuple[Any, int]] = []
+
+    def fitting(problem: Any, now: int) -> int:
+        asked.append((problem, now))
+        return 2
+
+    monkeypatch.setattr(live_module, "fitting_depth", fitting)
+    psfs = np.stack([np.roll(spots_psf(), k, axis=0) for k in (0, 2, 4)])[:, None]
+    places = np.array([[0, 0, z] for z in (1e4, 2e4, 4e4)])
+    reconstructor = LiveReconstructor(Calibration(psfs, places), noise=NOISE, z_um=19_000.0)
+    assert reconstructor.fitting_depth_um(photograph(0, 0)) == 4e4
+    ((problem, now),) = asked
+    assert now == 1, "the one in use"
+    assert problem.n_planes == 3, "an empty one, too"
+    assert (problem.options.drop_empty, problem.options.model) == (False, "convolution")
+
+
 def test_a_depth_that_there_is_not_is_refused() -> None:
     live(plane=0)
     with pytest.raises(InputError, match="plane 1 is none of the 1 depths, counted from 0"):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 from dataclasses import replace
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -29,6 +30,29 @@ PICTURE = LivePicture(
     work_ms=1.0,
     budget_ms=2.0,
 )
+
+
+@pytest.mark.parametrize(
+    ("model", "smooth", "erased", "filtered", "varies", "words"),
+    [
+        ("convolution", False, 0, False, False, ""),
+        ("local", True, 0, False, True, "local model, background"),
+        ("lowrank", False, 3, False, True, "low rank, 25.0% of the pixels left out"),
+        ("convolution", False, 0, False, True, "one PSF for all of the field"),
+        ("own", False, 0, False, True, "own"),
+        ("local", True, 3, True, False, ""),  # the filter knows nothing of these
+        ("local", True, 3, True, True, "one PSF for all of the field"),
+    ],
+)
+def test_the_camera_that_made_a_picture_is_told_where_it_is_no_plain_one(
+    model: str, smooth: bool, erased: int, filtered: bool, varies: bool, words: str
+) -> None:
+    def of(model: str, *, smooth: bool, erased: int) -> SimpleNamespace:
+        return SimpleNamespace(model=model, smooth=smooth, valid=np.arange(12) >= erased)
+
+    preview = SimpleNamespace(problem=of("convolution", smooth=False, erased=0))
+    level: Any = SimpleNamespace(problem=of(model, smooth=smooth, erased=erased), preview=preview)
+    assert Level.camera(level, filtered=filtered, varies=varies) == words
 
 
 @pytest.mark.parametrize(
