@@ -35,6 +35,7 @@ _RUNS = tuple(
         "recording_rest",
         "repair",
         "resume",
+        "run_by_its_files",
         "run_control",
         "runner",
         "runner_in_pieces",

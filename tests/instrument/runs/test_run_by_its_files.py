@@ -1,0 +1,130 @@
+"""A run as its files tell it: its period, its start, who holds it, what is damaged, and how it ended."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from instrument.runs.export import _told
+from instrument.runs.log import Gap
+from instrument.runs.repair import file_problems
+from instrument.runs.run import FinishReason, Run
+from instrument.runs.run_files import log_size, noted_damage
+from instrument.runs.writer import RunWriter
+from tests.instrument.files.test_atomic import open_below
+from tests.instrument.runs.test_store import BENCH, frame, new_run
+
+
+def recorded(folder: Path, *indices: int) -> Path:
+    """Return a recording of frames 20 ms apart, by its own clock; the others were lost."""
+    with RunWriter.create(folder, label="r", bench=BENCH) as writer:
+        writer.start()
+        done = 0
+        for index in indices:
+            if index > done:
+                writer.gap(Gap(done, index - done, 0))
+            one = frame(index)
+            times = {"host_time_ns": 7 * index, "device_time_ns": 20_000_000 * index}
+            writer.write([replace(one, metadata=replace(one.metadata, **times))])
+            done = index + 1
+        return writer.finish(FinishReason.COMPLETED).path
+
+
+def test_a_recordings_period_counts_lost_frames_from_whatever_its_first_is(tmp_path: Path) -> None:
+    assert Run.open(recorded(tmp_path, 2, 3, 7)).frame_period_s == pytest.approx(0.02)
+
+
+def test_a_run_starts_before_its_first_step_with_what_the_bench_had(tmp_path: Path) -> None:
+    with new_run(tmp_path) as writer:
+        start = Run.open(writer.path).start
+    assert (start.index, start.repeat, start.label) == (-1, 0, "start")
+    assert (start.exposure_ms, start.gain) == (1.0, 1.0)
+
+
+@pytest.mark.parametrize("held", ["folder", "lock"])
+def test_a_run_is_held_by_its_folder_or_by_its_lock(
+    tmp_path: Path, held: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = recorded(tmp_path, 0)
+    locked = {"folder": path, "lock": path / "lock"}[held]
+    assert not Run.open(path).is_locked()
+    monkeypatch.setattr("instrument.runs.run.is_locked", lambda place: place == locked)
+    assert Run.open(path).is_locked()
+
+
+def test_a_look_at_sizes_leaves_a_note_until_what_it_tells_of_is_whole(tmp_path: Path) -> None:
+    path = recorded(tmp_path, 0, 1, 2)
+    chunk = Run.open(path).array.chunk_path(1)
+    whole = chunk.read_bytes()
+    chunk.write_bytes(bytes(len(whole)))
+    assert Run.open(path).damaged(read=False) == ()
+    assert noted_damage(path) == set()
+    assert [one.index for one in Run.open(path).damaged()] == [1]
+    assert noted_damage(path) == {1}
+    assert [one.index for one in Run.open(path).damaged(read=False)] == [1]
+    chunk.write_bytes(whole[:-1])
+    (path / "damaged.json").unlink()
+    assert [one.index for one in Run.open(path).damaged(read=False)] == [1]
+    assert noted_damage(path) == set(), "a look at sizes notes nothing"
+    assert [one.index for one in Run.open(path).damaged()] == [1]
+    chunk.write_bytes(whole)
+    assert Run.open(path).damaged(read=False) == ()
+    assert noted_damage(path) == set()
+    assert not (path / "damaged.json").exists()
+
+
+def test_a_kept_text_has_its_copy_in_the_log(tmp_path: Path) -> None:
+    with new_run(tmp_path) as writer:
+        writer.keep_text("more.json", '{"a": 1}')
+        path = writer.path
+    (path / "more.json").unlink()
+    problems = [str(problem) for problem in Run.open(path).files.problems()]
+    assert problems == ["more.json: is gone"]
+    assert Run.open(path).files.copies["more.json"] == '{"a": 1}'
+    (path / "more.json").write_text('{"a": 2}')  # put right by hand
+    assert Run.open(path).files.problems() == []
+    (path / "more.json").write_text("{")
+    assert [str(problem) for problem in Run.open(path).files.problems()] == [
+        "more.json: is not as it was written"
+    ]
+
+
+def test_who_finishes_a_run_closes_its_log_and_keeps_the_end_of_one_that_had_ended(tmp_path: Path) -> None:
+    path = recorded(tmp_path, 0)
+    ended, size = Run.open(path).state["finished_utc"], log_size(path)
+    with RunWriter.reopen(path) as again:
+        assert open_below(tmp_path)
+        assert again.finish(FinishReason.COMPLETED).state["finished_utc"] == ended
+        assert not open_below(tmp_path)
+    last = json.loads((path / "log.jsonl").read_bytes()[size:])
+    assert (last["kind"], last["utc"]) == ("finished", ended)
+    with new_run(tmp_path) as writer:
+        writer.start(steps=5)
+        began = Run.open(writer.path).state["started_utc"]
+        run = writer.finish(FinishReason.STOPPED)
+    assert run.state["finished_utc"] >= began
+
+
+@pytest.mark.parametrize(
+    ("values", "told"),
+    [([3.0], 3.0), ([3.0, 3.0], 3.0), ([3.0, 4.0], "3.0; 4.0"), (["a", "a", "b"], "a; a; b")],
+)
+def test_what_all_frames_share_is_told_once(values: list[Any], told: Any) -> None:
+    assert _told(values) == told
+
+
+def test_an_array_is_held_against_the_last_of_the_logs_ends(tmp_path: Path) -> None:
+    """A run that ended twice was described twice: the sums of the second time count."""
+    with new_run(tmp_path) as writer:
+        writer.start(steps=5)
+        writer.write([frame(0), frame(1)])
+        path = writer.finish(FinishReason.STOPPED).path
+    with RunWriter.reopen(path) as again:
+        again.start()
+        again.write([frame(i) for i in (2, 3, 4)])
+        again.finish(FinishReason.COMPLETED)
+    assert [str(problem) for problem in file_problems(Run.open(path))] == []
