@@ -90,6 +90,7 @@ AREAS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
             *_RUNS,
             "tests/instrument/files/test_atomic.py",
             "tests/instrument/files/test_record.py",
+            "tests/instrument/test_result_record.py",
             "tests/instrument/test_cli_acquisition.py",
         ),
     ),
@@ -128,6 +129,7 @@ AREAS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
             "recon/base/noise.py",
         ),
         (
+            "tests/drivers/test_cache.py",
             "tests/drivers/test_camera_settings.py",
             "tests/drivers/test_drives.py",
             "tests/drivers/test_stage_axes.py",

@@ -9,9 +9,9 @@ import pytest
 import tifffile
 
 from instrument.cli import main
-from instrument.files.images import read_stack
+from instrument.files.images import ImageFile, read_stack
 from instrument.reconstruction.video_files import require_video
-from instrument.runs.imported import FilmFacts, import_film
+from instrument.runs.imported import FilmFacts, _metadata, import_film
 from instrument.runs.inspection import verify
 from instrument.runs.run import Run
 from tests.mocks.recordings import write_recording
@@ -90,3 +90,16 @@ def test_colour_and_floats_and_what_is_said_over_what_the_file_tells(tmp_path: P
         assert run.frame_period_s == pytest.approx(0.04)
         assert run.provenance["pixel_pitch_um"] == 3.0
         assert run.metadata(0).pixel_format == kind
+
+
+@pytest.mark.parametrize(
+    ("told", "gain", "black"), [({"gain": 4.5, "black_level": 64.0}, 4.5, 64.0), ({}, 1.0, 0.0)]
+)
+def test_what_a_film_tells_of_its_camera_is_taken(
+    tmp_path: Path, told: dict[str, float], gain: float, black: float
+) -> None:
+    path = tmp_path / "film.tif"
+    path.touch()
+    first = _metadata(ImageFile(path, FRAMES, metadata=told), 12.5)
+    assert (first.gain, first.black_level, first.exposure_ms) == (gain, black, 12.5)
+    assert (first.pixel_format, first.significant_bits, first.roi) == ("Mono16", 16, (0, 0, 12, 10))
