@@ -108,23 +108,11 @@ def load_calibration(folder: Path | str) -> Calibration:
     is damaged.
     """
     path = Path(folder)
-    if not path.exists():
-        raise CalibrationFileError(path, "does not exist.")
-    if not (path / _JSON).is_file():
-        raise CalibrationFileError(path, f"is no calibration: it holds no {_JSON}.")
-    record = CALIBRATION.read(path / _JSON)
+    record = _record(path)
     with CALIBRATION.damaged(path / _JSON):
-        psfs = np.ascontiguousarray(_read_array(path, _PSFS, record["sha256"]).swapaxes(0, 1))
-        has_background = _BACKGROUND in record["sha256"]
-        positions = [[math.nan if v is None else v for v in row] for row in record["source_positions_um"]]
-        return Calibration(
-            psfs=psfs,
-            source_positions_um=np.array(positions, np.float64).reshape(-1, 3),
-            background=_read_array(path, _BACKGROUND, record["sha256"]) if has_background else None,
-            geometry=CALIBRATION.value(Geometry, record["geometry"], path / _JSON),
-            quality=record["quality"],
-            provenance=record["provenance"],
-        )
+        arrays = {name: _read_array(path / name, known) for name, known in _checksums(record).items()}
+        psfs = np.ascontiguousarray(arrays[_PSFS].swapaxes(0, 1))
+        return _made(record, path, psfs, arrays.get(_BACKGROUND))
 
 
 def check_calibration(folder: Path | str, *, read: bool = True) -> None:
@@ -133,16 +121,21 @@ def check_calibration(folder: Path | str, *, read: bool = True) -> None:
     ``read``: False looks at the record only, and whether its arrays are there.
     """
     path = Path(folder)
-    if not (path / _JSON).is_file():
-        raise CalibrationFileError(path, f"is no calibration: it holds no {_JSON}.")
-    record = CALIBRATION.read(path / _JSON)
+    record = _record(path)
     with CALIBRATION.damaged(path / _JSON):
-        CALIBRATION.value(Geometry, record["geometry"], path / _JSON)
-        for name, checksum in record["sha256"].items():
+        sources, *of_one = record["shape"]
+        shapes = {_PSFS: (sources, *of_one), _BACKGROUND: tuple(of_one)}
+        checksums = _checksums(record)
+        for name, checksum in checksums.items():
             if not (path / name / "0").is_dir():
                 raise CalibrationFileError(path / name, "is missing.", _RESTORE)
             if read:
-                _check_array(path, name, checksum)
+                shapes[name] = _check_array(path / name, checksum)
+        if read:
+            channels, sources, *of_one = shapes[_PSFS]
+            shapes[_PSFS] = (sources, channels, *of_one)
+        blank = {name: np.broadcast_to(np.float32(0), shapes[name]) for name in checksums}
+        _made(record, path, blank[_PSFS], blank.get(_BACKGROUND))
 
 
 def is_calibration(folder: Path | str) -> bool:
@@ -207,6 +200,44 @@ def newest_calibration(runs: Path) -> Path | None:
     return max(found, key=lambda file: file.stat().st_mtime).parent if found else None
 
 
+def _record(path: Path) -> dict[str, Any]:
+    """Return what stands in a calibration's record."""
+    if not path.exists():
+        raise CalibrationFileError(path, "does not exist.")
+    if not (path / _JSON).is_file():
+        raise CalibrationFileError(path, f"is no calibration: it holds no {_JSON}.")
+    return CALIBRATION.read(path / _JSON)
+
+
+def _checksums(record: Mapping[str, Any]) -> dict[str, str]:
+    """Return the checksums of the arrays that a record is of, by their names: of the PSFs always."""
+    known = record["sha256"]
+    return {name: known[name] for name in (_PSFS, _BACKGROUND) if name == _PSFS or name in known}
+
+
+def _made(
+    record: Mapping[str, Any],
+    path: Path,
+    psfs: npt.NDArray[np.float32],
+    background: npt.NDArray[np.float32] | None,
+) -> Calibration:
+    """Return the calibration of a record and its arrays; errors of many kinds where they do not go together.
+
+    The checksums are of values in a row: of how many rows and columns the record alone tells.
+    """
+    if list(psfs.shape) != record["shape"]:
+        raise ValueError(f"its PSFs are {psfs.shape}, recorded is {record['shape']}")
+    positions = [[math.nan if v is None else v for v in row] for row in record["source_positions_um"]]
+    return Calibration(
+        psfs=psfs,
+        source_positions_um=np.array(positions, np.float64).reshape(-1, 3),
+        background=background,
+        geometry=CALIBRATION.value(Geometry, record["geometry"], path / _JSON),
+        quality=record["quality"],
+        provenance=record["provenance"],
+    )
+
+
 def _write(calibration: Calibration, folder: Path) -> None:
     pitch = calibration.geometry.pixel_pitch_um
     arrays = {_PSFS: np.ascontiguousarray(calibration.psfs.swapaxes(0, 1))}
@@ -239,20 +270,22 @@ def _write_ome_zarr(array: npt.NDArray[np.float32], path: Path, axes: str, pitch
     group.attrs["ome"] = ome_attributes(path.name, axes, {"y": pitch_um, "x": pitch_um})
 
 
-def _read_array(folder: Path, name: str, checksums: Mapping[str, str]) -> npt.NDArray[np.float32]:
-    with _reading(folder / name):
-        array = np.ascontiguousarray(_stored(folder / name)[...])
-    _require_checksum(folder / name, _sha256(array), checksums[name])
+def _read_array(path: Path, checksum: str) -> npt.NDArray[np.float32]:
+    with _reading(path):
+        array = np.ascontiguousarray(_stored(path)[...])
+    _require_checksum(path, _sha256(array), checksum)
     return array.astype(np.float32, copy=False)
 
 
-def _check_array(folder: Path, name: str, checksum: str) -> None:
+def _check_array(path: Path, checksum: str) -> tuple[int, ...]:
+    """Return the shape of an array whose values have their checksum."""
     digest = hashlib.sha256()
-    with _reading(folder / name):
-        stored = _stored(folder / name)
-        for number in range(stored.shape[0]):
-            digest.update(np.ascontiguousarray(stored[number]).data)
-    _require_checksum(folder / name, digest.hexdigest(), checksum)
+    with _reading(path):
+        stored = _stored(path)
+        for place in np.ndindex(stored.shape[:-2]):
+            digest.update(np.ascontiguousarray(stored[place]).data)
+    _require_checksum(path, digest.hexdigest(), checksum)
+    return stored.shape
 
 
 def _stored(array: Path) -> zarr.Array[Any]:

@@ -158,7 +158,7 @@ class RecordFormat:
         """Turn what goes wrong while a record's fields are taken apart into an error that names the file."""
         try:
             yield
-        except (LookupError, TypeError, ValueError, AttributeError) as error:
+        except (LookupError, TypeError, ValueError, AttributeError, OverflowError) as error:
             why = f"lacks {error}" if isinstance(error, KeyError) else str(error)
             raise self.error(path, f"is a damaged {self.thing}: {why}.", self.restore or self.make) from error
 

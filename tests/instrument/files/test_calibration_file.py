@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import json
+import tracemalloc
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +15,7 @@ import zarr
 from instrument.files import atomic, calibration_file
 from instrument.files.calibration_file import (
     CalibrationFileError,
+    check_calibration,
     is_calibration,
     load_calibration,
     save_calibration,
@@ -135,9 +137,16 @@ def test_a_wrong_path_is_named(tmp_path: Path) -> None:
         load_calibration(tmp_path / "file")
 
 
-def edit(path: Path, **changes: Any) -> None:
+REQUIRED = ("shape", "source_positions_um", "geometry", "quality", "provenance", "sha256")
+
+
+def edit(path: Path, changes: dict[str, Any] | str) -> None:
+    """Change some of a record, or take a field away."""
     record = json.loads((path / "calibration.json").read_text())
-    record |= changes
+    if isinstance(changes, str):
+        del record[changes]
+    else:
+        record |= changes
     (path / "calibration.json").write_text(json.dumps(record))
 
 
@@ -148,14 +157,40 @@ def edit(path: Path, **changes: Any) -> None:
         ({"version": 99}, "version 99 is not known.*Update"),
         ({"source_positions_um": [[0, 0, 1]]}, "is a damaged calibration"),
         ({"geometry": {"pixel_pitch_um": "blue"}}, "is a damaged calibration"),
+        ({"source_positions_um": [[0, 0, 1], [0, 0, 2], [0, 0, "far"]]}, "is a damaged calibration"),
+        ({"shape": [10**200, 2, 12, 20]}, "is a damaged calibration"),
         ({"sha256": {}}, "is a damaged calibration: lacks 'psfs"),
+        ({"shape": [3, 2, 20, 12]}, r"is a damaged calibration: its PSFs are \(3, 2, 12, 20\)"),
+        ({"quality": "good"}, "is a damaged calibration: quality must be"),
+        *((lacking, f"is a damaged calibration: lacks '{lacking}'") for lacking in REQUIRED),
     ],
 )
-def test_a_changed_description_is_named(tmp_path: Path, changes: dict[str, Any], message: str) -> None:
+def test_a_changed_description_is_named_by_who_loads_it_and_by_who_checks_it(
+    tmp_path: Path, changes: dict[str, Any] | str, message: str
+) -> None:
     path = save_calibration(make(), tmp_path / "c")
-    edit(path, **changes)
+    edit(path, changes)
     with pytest.raises(CalibrationFileError, match=message):
         load_calibration(path)
+    with pytest.raises(CalibrationFileError, match=message):
+        check_calibration(path)
+    if changes != {"shape": [3, 2, 20, 12]}:  # which only the arrays contradict
+        with pytest.raises(CalibrationFileError, match=r"is a damaged calibration|'format' is|not known"):
+            check_calibration(path, read=False)
+
+
+def test_a_sound_calibration_is_checked_a_psf_at_a_time(tmp_path: Path) -> None:
+    for saved in (make(), make(background=False)):
+        path = save_calibration(saved, tmp_path / "small", overwrite=True)
+        check_calibration(path)
+        check_calibration(path, read=False)
+    psfs = np.random.default_rng(0).random((96, 1, 256, 256), np.float32)
+    path = save_calibration(Calibration(psfs, np.zeros((96, 3))), tmp_path / "large")
+    tracemalloc.start()
+    check_calibration(path)
+    _, peak = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert peak < psfs.nbytes / 2
 
 
 def test_broken_json_is_named(tmp_path: Path) -> None:
