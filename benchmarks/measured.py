@@ -27,27 +27,17 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from benchmarks.measured_blind import blind
 from benchmarks.measured_labs import cut, labs
+from benchmarks.measured_scenes import load, ramp
+from benchmarks.measured_speed import speed
 from benchmarks.measured_variants import coarse_pairs, dark_levels, variants
 from benchmarks.uncertainty import measured_pairs_held
 from recon import Calibration, Reconstruction, reconstruct
-from recon.base.blocks import block_mean
 from recon.base.threads import get_threads, set_threads
-from recon.evaluation.measured_sets import MeasuredSet, measured_set
 
 Array = npt.NDArray[Any]
 PRIORS = ("tv", "l1", "nonnegative")
 LAST = 8
 """Of the USAF target's 44 planes, those in which light gathers that fits nowhere."""
-
-
-def load(name: MeasuredSet, binning: int) -> tuple[Calibration, Array]:
-    """Return a set as a calibration of unknown depths, and its photograph, binned."""
-    psfs, photograph = measured_set(name)
-    height, width = (n // binning * binning for n in photograph.shape)
-    psfs, photograph = (
-        block_mean(a, binning) for a in (psfs[:, :height, :width], photograph[:height, :width])
-    )
-    return Calibration(psfs[:, None], np.full((len(psfs), 3), np.nan)), photograph
 
 
 def solved(image: Array, calibration: Calibration, **options: Any) -> tuple[Reconstruction, float]:
@@ -187,17 +177,6 @@ def usaf(folder: Path, binning: int) -> list[str]:
     return [*lines, "", *said(results), "", f"![The target: every bar in its own depth]({picture})"]
 
 
-def ramp(volume: Array) -> float:
-    """Return how linearly the brightest depth goes with x, weighed by its light: a correlation."""
-    brightest = volume.max(axis=0)
-    weight = (
-        np.where(brightest > 0.3 * np.percentile(brightest, 99.9), brightest, 0).ravel().astype(np.float64)
-    )
-    depth, x = volume.argmax(axis=0).ravel(), np.tile(np.arange(volume.shape[2]), volume.shape[1])
-    covariance = np.cov(np.stack([depth, x]), aweights=weight)
-    return float(covariance[0, 1] / np.sqrt(covariance[0, 0] * covariance[1, 1]))
-
-
 def draw_row(pictures: list[tuple[str, Array]], path: Path) -> None:
     """Draw pictures side by side, square roots of their light."""
     plt = pyplot()
@@ -280,6 +259,7 @@ SECTIONS: Mapping[str, tuple[str, Callable[[Path], list[str]]]] = {
     "cut": ("What tells that the hand's PSF was cut", cut),
     "coarse": ("Pairs in coarse pixels", coarse_pairs),
     "dark": ("Pairs whose dark level is wrong", dark_levels),
+    "speed": ("Time against accuracy", speed),
     "intervals": ("How far the pairs' pictures may be off", intervals),
 }
 """By name: a title, and what makes the section."""
