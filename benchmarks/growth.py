@@ -147,7 +147,7 @@ def measure(case: Case, iterations: int, foretold: bool, answer: Any) -> None:
     reconstruct(small[0][0], small[1], options, iterations=2)  # kernels are compiled
     if foretold:
         told = forecast(Measurement(photographs[0]), calibration, options)
-        answer.send((told.seconds, *told.between_bytes))
+        answer.send((told.seconds, told.memory_bytes))
         return
     meter, began = MemoryMeter(), time.perf_counter()
     reconstruct(photographs[0], calibration, options)
@@ -191,7 +191,7 @@ def film(case: Case, foretold: bool, answer: Any) -> None:
             with trial_of(asked) as trial:
                 told = forecast_video(trial)
             assert told is not None
-            answer.send((told.seconds, *told.between_bytes))
+            answer.send((told.seconds, told.memory_bytes))
             return
         meter, began = MemoryMeter(), clock()
         reports = make_film(asked)
@@ -238,7 +238,7 @@ def holograms(case: Case, foretold: bool, answer: Any) -> None:
     ctypes.CDLL(None).malloc_trim(0)
     if foretold:
         told = forecast_hologram(display, targets, options, frames=case.again)
-        answer.send((told.seconds, *told.between_bytes))
+        answer.send((told.seconds, told.memory_bytes))
         return
     meter, began, slm = MemoryMeter(), time.perf_counter(), None
     for _ in range(case.again):
@@ -246,23 +246,16 @@ def holograms(case: Case, foretold: bool, answer: Any) -> None:
     answer.send((time.perf_counter() - began, meter.peak_mib() * 2**20))
 
 
-def measured(case: Case, iterations: int) -> tuple[float, float, float, float, float]:
+def measured(case: Case, iterations: int) -> tuple[float, float, float, float]:
     """Forecast and run a case, each in a process of its own.
 
-    Returns the seconds and bytes that it took, the seconds that were told, and the least and most bytes.
+    Returns the seconds and bytes that it took, and those that were told.
     """
     work: Callable[..., None] = film if case.frames else holograms if case.expansion else measure
     further = () if case.frames or case.expansion else (iterations,)
     told = in_process(work, case, *further, True)
     took = in_process(work, case, *further, False)
-    return took[0], took[1], told[0], told[1], told[2]
-
-
-def missed(took: float, least: float, most: float) -> str:
-    """Say by how much what was told misses what was taken; of a range that holds it, the range."""
-    if least == most or not least <= took <= most:
-        return f"{(most if took > most or least == most else least) / took - 1:+.0%}"
-    return f"{least / took - 1:+.0%} to {most / took - 1:+.0%}"
+    return took[0], took[1], told[0], told[1]
 
 
 def in_process(work: Callable[..., None], *arguments: object) -> tuple[float, ...]:
@@ -446,11 +439,11 @@ def main() -> None:
         for size, case in grown:
             runs = [measured(case, options.iterations) for _ in range(options.times)]
             found.append(tuple(map(float, np.median(runs, axis=0))))
-            for took_s, took_bytes, told_s, least, most in runs:
-                rows.append([what, size, took_s, told_s, took_bytes / 2**20, least / 2**20, most / 2**20])
+            for took_s, took_bytes, told_s, told_bytes in runs:
+                rows.append([what, size, took_s, told_s, took_bytes / 2**20, told_bytes / 2**20])
                 print(
-                    f"{what:<8}{size:>9}  {took_s:8.2f} s (forecast {missed(took_s, told_s, told_s)})  "
-                    f"{took_bytes / 2**20:8.1f} MiB (forecast {missed(took_bytes, least, most)})",
+                    f"{what:<8}{size:>9}  {took_s:8.2f} s (forecast {told_s / took_s - 1:+.0%})  "
+                    f"{took_bytes / 2**20:8.1f} MiB (forecast {told_bytes / took_bytes - 1:+.0%})",
                     flush=True,
                 )
         seconds, memory = [f[0] for f in found], [f[1] for f in found]
@@ -464,16 +457,14 @@ def main() -> None:
         axes.loglog(sizes, seconds, "o-", color=SECOND, label="seconds")
         axes.loglog(sizes, [f[2] for f in found], "x", color=SECOND, label="forecast")
         axes.loglog(sizes, [m / 2**20 for m in memory], "s-", color=ACCENT, label="MiB")
-        axes.loglog(sizes, [f[4] / 2**20 for f in found], "+", color=ACCENT, label="forecast")
+        axes.loglog(sizes, [f[3] / 2**20 for f in found], "+", color=ACCENT, label="forecast")
         axes.set_xticks(sizes, [str(size) for size in sizes])
         axes.minorticks_off()
         style(axes, words.replace("; ", "\n").replace(", ", "\n"), what, "", title_size=9)
         axes.legend(fontsize=8, frameon=False, labelcolor=INK)
     with (options.out / "growth.csv").open("w", newline="") as file:
         writer = csv.writer(file)
-        writer.writerow(
-            ["what", "size", "seconds", "forecast_s", "mib", "forecast_mib_least", "forecast_mib"]
-        )
+        writer.writerow(["what", "size", "seconds", "forecast_s", "mib", "forecast_mib"])
         writer.writerows(rows)
     figure.suptitle(f"{options.iterations} iterations, SIMULATED", fontsize=10, color=INK)
     save_figure(figure, options.out / "growth.png")

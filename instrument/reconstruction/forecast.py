@@ -40,8 +40,6 @@ ASTRAY = 1.5
 UNEVEN = 1.2
 """How many times as long, or as short, one may take later as the first ones did. A guess: a volume by the
 low-rank model took 1.05 and 1.06 times the end that is told without this (docs/benchmarks/time-told.md)."""
-_WORTH_TELLING = 0.1
-"""Share of the memory; less of it is within what a forecast is good for."""
 
 
 @dataclass(frozen=True, slots=True, repr=False)
@@ -58,8 +56,6 @@ class Forecast:
         At most so many: it may settle before.
     memory_bytes : float
         At the peak beyond what the program takes; NaN where the system does not say.
-    memory_apart_bytes : float
-        How much more or less it may be: memory that is freed on the way, and given back to the system or not.
     settles : int or None
         After how many iterations it ends, by the course of the first ones; None where they do not tell.
     counted : bool
@@ -76,7 +72,6 @@ class Forecast:
     """What there are several of."""
     where: str = ""
     """Whose memory it is, where not this program's."""
-    memory_apart_bytes: float = 0.0
 
     @property
     def seconds(self) -> float:
@@ -96,18 +91,6 @@ class Forecast:
     def _after(self, iterations: float) -> float:
         return self.beside_s + iterations * self.iteration_s
 
-    @property
-    def between_bytes(self) -> tuple[float, float]:
-        """Least and most memory that it is expected to take."""
-        apart = self.memory_apart_bytes
-        return max(self.memory_bytes - apart, 0.0), self.memory_bytes + apart
-
-    @property
-    def _memory(self) -> str:
-        least, most = map(in_words, self.between_bytes)
-        told_apart = self.memory_apart_bytes > _WORTH_TELLING * self.memory_bytes
-        return f"{least} to {most}" if told_apart else in_words(self.memory_bytes)
-
     def __repr__(self) -> str:
         """Say it in a line, as Python shows what it is."""
         return f"<Forecast: {self}>"
@@ -117,7 +100,7 @@ class Forecast:
         an = "an" if self.each[0] in "aeiou" else "a"
         each = f", {1e3 * self.iteration_s:.3g} ms {an} {self.each}" if self.iterations else ""
         known = self.memory_bytes == self.memory_bytes
-        memory = f"; {self._memory} of memory{self.where}" if known else ""
+        memory = f"; {in_words(self.memory_bytes)} of memory{self.where}" if known else ""
         if self.counted or not self.iterations:
             count = f", {self.settles} of them" if each else ""
             return f"about {duration(self.seconds)}{each}{count}{memory}"

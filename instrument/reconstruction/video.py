@@ -43,6 +43,7 @@ from recon.reconstruction.decoys import check_calibration
 from recon.reconstruction.measurement import Floats, Measurement
 from recon.reconstruction.options import ReconstructionOptions
 from recon.reconstruction.problem import Problem
+from recon.solvers.memory import give_back
 from recon.streams.joint import JOINT_BLOCK, JOINT_ITERATIONS, require_joint
 from recon.streams.stillness import has_light
 from recon.streams.video import BLOCK, COLD_ITERATIONS, LOOKED_AT, VideoSolver, stream_problem, weight_of
@@ -230,6 +231,7 @@ def write_shown(
     prepared: PreparedVideo, frames: Sequence[int], on_frame: Callable[[int], object] = lambda _: None
 ) -> None:
     """Write an MP4 of these frames, which are on the disk; raises FileError or OSError."""
+    give_back()  # what solving freed: an encoder's memory would come on top of it, or not
     request, pictures = prepared.request, VideoPictures(prepared.request.out)
     black, white = levels_of(pictures.flat(index) for index in samples_of(frames))
 

@@ -41,11 +41,6 @@ SHOWN = 40
 """Pictures of an MP4 that tell what one takes: VP9 keeps 25 before it writes."""
 ATTEMPTS = 2
 """That a trial has in which workers are lost."""
-GIVEN_BACK = 4 * 2**20
-"""Bytes that solving frees and the C library gives back before the MP4 is written, or not.
-
-The same film goes one way or the other, and so does its trial (docs/benchmarks/time-told.md).
-"""
 
 
 @dataclass(frozen=True)
@@ -122,7 +117,6 @@ def forecast_video(
         counted=True,
         each="frame",
         where=f" in each of {count(workers, 'worker')}" if elsewhere else "",
-        memory_apart_bytes=GIVEN_BACK if video.film and not elsewhere else 0.0,
     )
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ctypes
 import fcntl
 import os
 import shutil
@@ -185,6 +186,12 @@ class MemoryMeter:
             yield
         finally:
             self._before += _reset_peak_mib() - present
+
+
+def give_back() -> None:
+    """Have the C library give memory that was freed back to the system; where it cannot, nothing happens."""
+    with suppress(OSError, AttributeError):
+        ctypes.CDLL(None).malloc_trim(0)
 
 
 def resident_bytes() -> float:

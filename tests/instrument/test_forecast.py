@@ -202,11 +202,3 @@ def test_like_ones_have_the_same_options_and_psfs(scene: tuple[Measurement, Cali
     two = Calibration(np.repeat(calibration.psfs, 2, 0), np.zeros((2, 3)))
     assert key() == key(z_um=100.0)
     assert len({key(), key(prior="l1"), key(iterations=30), key(two)}) == 4
-
-
-def test_memory_that_may_be_given_back_or_not_is_a_range_where_that_is_worth_telling() -> None:
-    told = Forecast(1.0, 0.1, 10, 23 * 2**20, 10, counted=True, memory_apart_bytes=4 * 2**20)
-    assert told.between_bytes == (19 * 2**20, 27 * 2**20)
-    assert "19.0 MiB to 27.0 MiB of memory" in str(told)
-    assert "; 96.0 MiB of memory" in str(replace(told, memory_bytes=96 * 2**20))
-    assert replace(told, memory_bytes=3 * 2**20).between_bytes[0] == 0
