@@ -12,7 +12,7 @@ import pytest
 from instrument.cli import main
 from instrument.files.errors import BenchError, FileError
 from instrument.reconstruction import video_forecast as module
-from instrument.reconstruction.video import PreparedVideo, prepare_video, solve_video
+from instrument.reconstruction.video import PreparedVideo, prepare_video, solve_video, write_shown
 from instrument.reconstruction.video_forecast import forecast_video, trial_of
 from instrument.reconstruction.video_job import VideoJob
 from instrument.reconstruction.video_work import BlockReport
@@ -73,6 +73,17 @@ def test_the_first_frames_are_carried_out_and_nothing_is_left(
     assert written == [1, 10, 1, 10], "an encoder is given as many pictures as the film has, up to a number"
     assert solved[1] == [5, 4], "what is solved together is carried out so"
     assert not list(tmp_path.iterdir())
+
+
+def test_what_solving_freed_is_given_back_before_a_film_is_encoded(
+    recording: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    order: list[str] = []
+    monkeypatch.setattr("instrument.reconstruction.video.give_back", lambda: order.append("given back"))
+    monkeypatch.setattr("instrument.reconstruction.video.write_mp4", lambda *_: order.append("encoded"))
+    with trial_of(request(recording, tmp_path, block=3)) as trial:
+        write_shown(trial.prepared, trial.prepared.job.plan.frames[:1])
+    assert order == ["given back", "encoded"]
 
 
 def test_of_a_film_that_was_begun_what_is_left_is_told(recording: Path, tmp_path: Path) -> None:
