@@ -13,7 +13,7 @@ from instrument.runs.export import _told
 from instrument.runs.log import Gap
 from instrument.runs.repair import file_problems
 from instrument.runs.run import FinishReason, Run
-from instrument.runs.run_files import log_size, noted_damage
+from instrument.runs.run_files import log_size
 from instrument.runs.writer import RunWriter
 from tests.instrument.files.test_atomic import open_below
 from tests.instrument.runs.test_store import BENCH, frame, new_run
@@ -56,25 +56,16 @@ def test_a_run_is_held_by_its_folder_or_by_its_lock(
     assert Run.open(path).is_locked()
 
 
-def test_a_look_at_sizes_leaves_a_note_until_what_it_tells_of_is_whole(tmp_path: Path) -> None:
+def test_a_look_at_sizes_reads_what_was_noted_as_damaged_and_no_more(tmp_path: Path) -> None:
     path = recorded(tmp_path, 0, 1, 2)
     chunk = Run.open(path).array.chunk_path(1)
     whole = chunk.read_bytes()
     chunk.write_bytes(bytes(len(whole)))
     assert Run.open(path).damaged(read=False) == ()
-    assert noted_damage(path) == set()
     assert [one.index for one in Run.open(path).damaged()] == [1]
-    assert noted_damage(path) == {1}
-    assert [one.index for one in Run.open(path).damaged(read=False)] == [1]
+    assert [one.index for one in Run.open(path).damaged(read=False, noted=[1, 2])] == [1]
     chunk.write_bytes(whole[:-1])
-    (path / "damaged.json").unlink()
-    assert [one.index for one in Run.open(path).damaged(read=False)] == [1]
-    assert noted_damage(path) == set(), "a look at sizes notes nothing"
-    assert [one.index for one in Run.open(path).damaged()] == [1]
-    chunk.write_bytes(whole)
-    assert Run.open(path).damaged(read=False) == ()
-    assert noted_damage(path) == set()
-    assert not (path / "damaged.json").exists()
+    assert [one.index for one in Run.open(path).damaged(read=False)] == [1], "its size tells"
 
 
 def test_a_kept_text_has_its_copy_in_the_log(tmp_path: Path) -> None:
