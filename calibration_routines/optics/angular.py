@@ -36,6 +36,7 @@ from instrument.files.errors import BenchError, SettingsError
 from instrument.files.figures import save_figure
 from instrument.files.record import RecordFormat
 from instrument.plan import Plan
+from instrument.runs.results import ANGULAR_FILE
 from instrument.runs.run import Run
 from instrument.runs.run_control import RunControl
 from recon.base.declare import RARE, option
@@ -226,7 +227,7 @@ class AngularRecord:
 ANGULAR = Purpose(
     AngularRecord,
     "angular.json",
-    "angular_response.json",
+    ANGULAR_FILE,
     RecordFormat(
         "diffuserbench angular sweep",
         "run of calibrate angular",

@@ -30,6 +30,7 @@ from instrument.files.atomic import named_by_worth, require_new
 from instrument.files.errors import BenchError, OperatorNeededError, SettingsError, count
 from instrument.files.images import write_image
 from instrument.files.record import RecordFormat, plain
+from instrument.runs.results import BEADS_FILE
 from instrument.runs.run import Run
 from instrument.runs.run_control import RunControl
 from recon.base.declare import RARE, option
@@ -191,7 +192,7 @@ class SlideRecord:
 BEADS = Purpose(
     SlideRecord,
     "bead_slide.json",
-    "went_on.json",
+    BEADS_FILE,
     RecordFormat(
         "diffuserbench bead slide",
         "run of calibrate beads",

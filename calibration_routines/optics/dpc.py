@@ -34,6 +34,7 @@ from instrument.files.record import RecordFormat, plain
 from instrument.plan import OFF, Light, Part, Plan, check
 from instrument.plan.led_shapes import HalfCircle
 from instrument.runs.acquire import abilities_of
+from instrument.runs.results import SURFACE_FILE
 from instrument.runs.run import Run
 from instrument.runs.run_control import RunControl
 from recon.analysis.dpc import SIDES, DpcOptics, deflections_deg, phase_from_halves, slopes_deg
@@ -161,7 +162,7 @@ class DpcRecord:
 DPC = Purpose(
     DpcRecord,
     "dpc_setup.json",
-    "dpc.json",
+    SURFACE_FILE,
     RecordFormat(
         "diffuserbench dpc setup",
         "run of calibrate dpc",

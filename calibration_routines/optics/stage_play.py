@@ -33,6 +33,7 @@ from instrument.files.record import RecordFormat, plain
 from instrument.plan import OFF, SOURCE, Part, Plan, check
 from instrument.plan.positions import StagePoints
 from instrument.runs.acquire import abilities_of
+from instrument.runs.results import STAGE_FILE
 from instrument.runs.run import Run
 from instrument.runs.run_control import RunControl
 from recon.base.blocks import block_mean
@@ -167,7 +168,7 @@ class StageRecord:
 STAGE = Purpose(
     StageRecord,
     "stage_check.json",
-    "stage.json",
+    STAGE_FILE,
     RecordFormat("diffuserbench stage check", "run of calibrate stage", restore="The frames beside it stay."),
 )
 _RESULT = RecordFormat("diffuserbench stage", "stage's play")

@@ -63,6 +63,7 @@ from instrument.files.reading import parse_json, read_bytes
 from instrument.files.record import plain, value_of
 from instrument.plan import Step
 from instrument.runs.acquire import acquire
+from instrument.runs.results import RETAKES_FILE
 from instrument.runs.run import Run
 from instrument.runs.run_control import EndedEarlyError, RunControl
 from instrument.runs.runner import Runner
@@ -392,8 +393,6 @@ def _stored(run: Run, index: int) -> Snapshot:
 
 
 # Retakes -----------------------------------------------------------------------------------------------
-RETAKES_FILE = "retakes.json"
-"""Beside ``sweep.json``, once a point was taken again: which, and in which run."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -102,7 +102,7 @@ def verify(run: Run, on_progress: Progress | None = None, *, read: bool = True) 
     """
     frames_noted, results_noted = (set(), set()) if read else noted_damage(run.path)
     damaged = run.damaged(on_progress, read=read, noted=frames_noted)
-    results = tuple(result_problems(run.path, run.files.copies, read=read, noted=results_noted))
+    results = tuple(result_problems(run.path, read=read, noted=results_noted))
     is_new = read or (frames_noted and not damaged) or (results_noted and not results)
     if is_new and not run.is_being_written:
         note_damage(run.path, [frame.index for frame in damaged], sorted({part.of for part in results}))

@@ -10,25 +10,28 @@ from instrument.files.calibration_file import CALIBRATION_FILES, check_calibrati
 from instrument.files.errors import FileError
 from instrument.files.images import read_image
 from instrument.files.reading import parse_json, read_bytes
-from instrument.runs.run_files import BENCH, DAMAGED, PLAN, PROVENANCE, STATE, FileProblem
+from instrument.runs.run_files import FileProblem
 
 PHOTOGRAPH_FILE = "photograph.tif"
 """What ``calibrate photograph`` makes of its frames."""
-_OF_THE_RUN = (PLAN, BENCH, PROVENANCE, STATE, DAMAGED)
+ANGULAR_FILE, SURFACE_FILE, STAGE_FILE = "angular_response.json", "dpc.json", "stage.json"
+"""What ``calibrate angular``, ``dpc`` and ``stage`` make of theirs."""
+BEADS_FILE, RETAKES_FILE = "went_on.json", "retakes.json"
+"""In which later runs a bead slide goes on, or points of a sweep were taken again."""
+RESULT_FILES = (ANGULAR_FILE, SURFACE_FILE, STAGE_FILE, BEADS_FILE, RETAKES_FILE)
+"""What else ends in ``.json`` in a run's folder is the run's own, or somebody else's."""
 _HEIGHT = "height_file"
 """In a surface's JSON: the name of the file of its numbers."""
 
 
-def result_problems(
-    run: Path, copied: Collection[str] = (), *, read: bool = True, noted: Collection[str] = ()
-) -> list[FileProblem]:
+def result_problems(run: Path, *, read: bool = True, noted: Collection[str] = ()) -> list[FileProblem]:
     """Return which calibrations, photographs and JSON files of results in a run's folder are damaged.
 
-    ``copied``: files that the log has copies of; they are the run's own. ``read``: False reads of a
-    calibration its record only, and PSFs and pictures where these are among the ``noted``.
+    ``read``: False reads of a calibration its record only, and PSFs and pictures where these are among the
+    ``noted``.
     """
     found = []
-    for path in _results(run, copied):
+    for path in _results(run):
         name = path.relative_to(run).as_posix()
         try:
             _look_at(path, read=read or name in noted)
@@ -41,12 +44,11 @@ def result_problems(
     return found
 
 
-def _results(run: Path, copied: Collection[str]) -> Iterator[Path]:
+def _results(run: Path) -> Iterator[Path]:
     for path in sorted(run.iterdir()):
-        own = path.name.startswith(".") or path.name in _OF_THE_RUN or path.name in copied
-        photograph = path.name.removeprefix(DOUBTFUL) == PHOTOGRAPH_FILE
+        made = path.name.removeprefix(DOUBTFUL) in (PHOTOGRAPH_FILE, *RESULT_FILES)
         calibration = any((path / part).exists() for part in CALIBRATION_FILES)
-        if not own and (photograph or calibration or path.suffix == ".json"):
+        if made or (calibration and not path.name.startswith(".")):
             yield path
 
 
@@ -55,7 +57,7 @@ def _look_at(path: Path, *, read: bool) -> None:
     if path.name.removeprefix(DOUBTFUL) == PHOTOGRAPH_FILE:
         if read:
             read_image(path)
-    elif path.suffix == ".json":
+    elif path.name.removeprefix(DOUBTFUL) in RESULT_FILES:
         record = parse_json(read_bytes(path))
         numbers = record.get(_HEIGHT) if isinstance(record, dict) else None
         if isinstance(numbers, str) and read:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import os
-import re
 import shutil
 import stat
 from collections.abc import Callable
@@ -17,24 +16,21 @@ import numpy as np
 import pytest
 
 from instrument.cli import main
-from instrument.files.calibration_file import save_calibration
 from instrument.files.errors import FileError
-from instrument.files.images import write_image
 from instrument.plan import Part, Plan
 from instrument.runs import writer
 from instrument.runs.acquire import look, prepare, prepare_resume, settle
 from instrument.runs.inspection import summary, verify
 from instrument.runs.log import AppendOnlyLog
 from instrument.runs.run import FinishReason, Run, RunCondition
-from instrument.runs.run_files import UNCHANGING, RunError
+from instrument.runs.run_files import FRAMES, UNCHANGING, RunError
 from instrument.runs.writer import FrameToStore, RunWriter, lock_run
-from recon.types import Calibration
+from tests.instrument.runs.damages import DAMAGES, newer
 from tests.instrument.runs.test_resume import open_mock_bench
-from tests.instrument.runs.test_store import BENCH, frame, new_run
+from tests.instrument.runs.test_store import frame, new_run
 
 pytestmark = pytest.mark.usefixtures("mock_drivers")
 
-FRAMES = "frames.ome.zarr"
 FILES = {
     "plan.json": "plan.json: ",
     "bench.json": "bench.json: ",
@@ -46,61 +42,6 @@ FILES = {
     f"{FRAMES}/0/zarr.json": f"{FRAMES}/0/zarr.json: ",
     f"{FRAMES}/0/c/1/0/0": "frame 1: ",
 }
-
-
-def deleted(path: Path, _: Path) -> None:
-    path.unlink()
-
-
-def truncated(path: Path, _: Path) -> None:
-    path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
-
-
-def one_bit(path: Path, _: Path) -> None:
-    data = bytearray(path.read_bytes())
-    data[len(data) // 3] ^= 1
-    path.write_bytes(data)
-
-
-def zeroed(path: Path, _: Path) -> None:
-    path.write_bytes(bytes(path.stat().st_size))
-
-
-def anothers(path: Path, other: Path) -> None:
-    shutil.copyfile(other, path)
-
-
-def newer(path: Path, _: Path) -> None:
-    """As a later version of this program writes it: with a field more, and its own number."""
-    text = path.read_text("latin-1")
-    text = re.sub(r'("(?:version|format|zarr_format)": )\d+', r"\g<1>99", text)
-    path.write_text(re.sub(r"^\{", '{"later": 1, ', text, count=1), "latin-1")
-
-
-def older(path: Path, _: Path) -> None:
-    """As it was when the run began: its first half, or its first line, or (an array) of fewer frames."""
-    text = path.read_text("latin-1")
-    text = re.sub(r'"shape": \[\s*3,', '"shape": [1,', text.replace("completed", "running"))
-    path.write_text(text.partition("\n")[0] + "\n" if path.suffix == ".jsonl" else text, "latin-1")
-
-
-DAMAGES = (deleted, truncated, one_bit, zeroed, anothers, newer, older)
-
-
-@pytest.fixture(scope="module")
-def runs(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
-    """Two completed runs of plans that differ, frames distinct."""
-    paths = []
-    for number in (0, 1):
-        plan = Plan(label=f"run {number}", parts=(Part(label="a", repeats=3 + number, exposures_ms=(5.0,)),))
-        with RunWriter.create(
-            tmp_path_factory.mktemp("runs"), label=plan.label, bench=BENCH, plan=plan
-        ) as writer:
-            writer.start(steps=len(plan))
-            stored = [frame(100 * number + i) for i in range(3 + number)]
-            writer.write([FrameToStore(i, one.image, one.metadata) for i, one in enumerate(stored)])
-            paths.append(writer.finish(FinishReason.COMPLETED).path)
-    return paths[0], paths[1]
 
 
 @pytest.mark.parametrize(
@@ -196,136 +137,6 @@ def test_what_is_no_file_in_a_files_place_is_said_and_not_waited_for(
             again.finish(FinishReason.COMPLETED)
     assert verify(Run.open(path)).is_sound
     assert all(np.array_equal(Run.open(path).frame(index), whole[index]) for index in range(3))
-
-
-def test_no_two_commands_contradict_each_other_about_a_changed_pixel(
-    tmp_path: Path, runs: tuple[Path, Path], capsys: pytest.CaptureFixture[str]
-) -> None:
-    path = tmp_path / "runs" / "run"
-    shutil.copytree(runs[0], path)
-    chunk = path / f"{FRAMES}/0/c/1/0/0"
-    whole = chunk.read_bytes()
-    (path / "damaged.json").write_text("no note at all")
-    one_bit(chunk, path)
-
-    def said(*words: str) -> tuple[int, str]:
-        status = main([*words, str(path.parent if words == ("list",) else path)])
-        return status, "".join(capsys.readouterr())
-
-    assert said("list")[1].count("DAMAGED") == 0  # by its size, and the list says so
-    assert "by their sizes" in said("list")[1]
-    with pytest.raises(RunError, match="frame 1 is damaged: its file has the CRC-32"):
-        Run.open(path).frame(1)
-    assert main(["export", str(path), str(tmp_path / "frames.npy")]) == 2
-    assert "frame 1 is damaged" in capsys.readouterr().err
-    words = "\n".join(look(path).lines())
-    assert words.startswith("frame 1: its file has the CRC-32")
-    status, verified = said("verify")
-    assert status == 1
-    assert words in verified
-    assert f"DAMAGED:      {words}" in said("show")[1]
-    assert "DAMAGED" in said("list")[1]
-    window = pytest.importorskip("gui.run_looks")
-    opened = window.look_into(path)
-    assert f"DAMAGED: {words}" in opened.about
-    assert "frame 1 is damaged" in window.read_frame(opened, 1)
-    chunk.write_bytes(whole)  # from a backup: no note outlives what it tells of
-    assert "DAMAGED" not in said("list")[1]
-    assert not (path / "damaged.json").exists()
-    one_bit(chunk, path)
-    assert said("verify")[0] == 1
-    (path / "damaged.json").write_text('{"frames": [7]}')
-    assert said("list")[0] == 0
-    chunk.write_bytes(whole)
-    assert said("verify")[0] == 0
-    assert not (path / "damaged.json").exists()
-
-
-_PSFS = "calibration/psfs.ome.zarr"
-CALIBRATION = {
-    "calibration/calibration.json": DAMAGES,
-    f"{_PSFS}/0/zarr.json": (deleted, truncated, zeroed, newer),
-    f"{_PSFS}/0/c/0/0/0/0": (deleted, truncated, one_bit, zeroed, anothers),
-}
-
-
-@pytest.fixture(scope="module")
-def calibrated(runs: tuple[Path, Path], tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
-    """Copies of the runs, with a calibration in each."""
-    paths = []
-    for number, run in enumerate(runs):
-        path = tmp_path_factory.mktemp("calibrated") / "run"
-        shutil.copytree(run, path)
-        psfs = np.random.default_rng(number).random((2, 1, 8, 9)).astype(np.float32)
-        made = Calibration(psfs, np.array([[0.0, 0.0, 1e4], [0.0, 0.0, 2e4 + number]]))
-        save_calibration(made, path / "calibration")
-        paths.append(path)
-    return paths[0], paths[1]
-
-
-@pytest.mark.parametrize(
-    ("name", "damage"),
-    [
-        (name, damage)
-        for name, damages in CALIBRATION.items()
-        for damage in damages
-        if (name, damage) != ("calibration/calibration.json", older)  # nothing in it is of an earlier state
-    ],
-    ids=lambda value: value if isinstance(value, str) else value.__name__,
-)
-def test_no_two_commands_contradict_each_other_about_a_damaged_calibration(
-    tmp_path: Path,
-    calibrated: tuple[Path, Path],
-    capsys: pytest.CaptureFixture[str],
-    name: str,
-    damage: Callable[[Path, Path], None],
-) -> None:
-    path = tmp_path / "runs" / "run"
-    shutil.copytree(calibrated[0], path)
-    whole = (path / name).read_bytes()
-    damage(path / name, calibrated[1] / name)
-
-    def said(*words: str) -> tuple[int, str]:
-        status = main([*words, str(path.parent if words == ("list",) else path)])
-        return status, " ".join("".join(capsys.readouterr()).split())
-
-    (words,) = look(path).lines()
-    assert words.startswith("calibration")
-    words = " ".join(words.split())
-    status, verified = said("verify")
-    assert status == 1
-    assert words in verified
-    assert "DAMAGED, completed, 3 of 3 frames read back" in verified
-    assert f"DAMAGED: {words}" in said("show")[1]
-    for _ in range(2):
-        assert said("resume")[0] == 1
-        status, resumed = said("resume")
-        assert "complete already, 3 frames read back, all as they were written." in resumed
-        assert f"What was made of the frames is damaged: {words}" in resumed
-    assert "DAMAGED" in said("list")[1]
-    window = pytest.importorskip("gui.run_looks")
-    for read in (False, True):
-        about = [" ".join(line.split()) for line in window.look_into(path, read=read).about]
-        assert f"DAMAGED: {words}" in about
-    (path / name).write_bytes(whole)  # from a backup
-    assert "DAMAGED" not in said("list")[1]
-    assert not (path / "damaged.json").exists()
-    assert said("verify")[0] == said("resume")[0] == 0
-
-
-def test_a_photograph_made_of_a_run_is_read_as_a_picture(
-    tmp_path: Path, runs: tuple[Path, Path], capsys: pytest.CaptureFixture[str]
-) -> None:
-    path = tmp_path / "run"
-    shutil.copytree(runs[0], path)
-    write_image(path / "photograph.tif", np.arange(20, dtype=np.float32).reshape(4, 5))
-    (path / "photograph_run.json").write_text("{}")
-    assert main(["resume", str(path)]) == main(["verify", str(path)]) == 0
-    assert "damaged" not in capsys.readouterr().out
-    truncated(path / "photograph.tif", path)
-    assert main(["resume", str(path)]) == main(["verify", str(path)]) == 1
-    said = "".join(capsys.readouterr())
-    assert "What was made of the frames is damaged: photograph.tif: " in said
 
 
 def test_a_bad_byte_in_a_log_costs_its_line_at_most(tmp_path: Path) -> None:
