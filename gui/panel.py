@@ -45,7 +45,10 @@ class Panel(QWidget):
         super().__init__(parent)
         self.session = session
         self.destroyed.connect(session.jobs.silence)  # panels live as long as their window
+        self._needing: dict[QWidget, tuple[Sequence[Kind], str]] = {}
+        """Which devices a button needs, with its tool tip of where it has them."""
         session.device_changed.connect(self._forget_fault)
+        session.device_changed.connect(self.let_press)
         self.body = QWidget()
         """Where the panel's own widgets go: give it a layout."""
         self.body.setSizePolicy(QSizePolicy.Policy.Expanding, QSizePolicy.Policy.Expanding)
@@ -170,8 +173,37 @@ class Panel(QWidget):
     def _forget_fault(self, kind: str) -> None:
         """Take a device's failure away that is over; the log keeps it."""
         device = self.session.bench.devices.get(cast(Kind, kind))
-        if device is not None and self.session.is_open(kind) and device.name in self._note.toolTip():
+        if device is None or not self.session.is_open(kind):
+            return
+        if in_the_window(device.name) in self._note.toolTip():
             self.accepted()
+
+    # What needs a device -------------------------------------------------------------------------
+    def lacks(self, kinds: Sequence[Kind]) -> str:
+        """Return why devices of the bench cannot be used now, the first of them that cannot; or nothing."""
+        for kind in kinds:
+            state = self.session.state(kind)
+            if kind in self.session.kinds and state.condition != "open":
+                return state.text or f"The {name_of(kind)} is {state.condition}."
+        return ""
+
+    def only_with(self, kinds: Sequence[Kind], *buttons: QWidget) -> None:
+        """Have buttons pressed only while devices are open; their tool tips say why they are not."""
+        for each in buttons:
+            _, tip = self._needing.get(each, ((), each.toolTip()))
+            self._needing[each] = kinds, tip
+        self.let_press()
+
+    def let_press(self, _kind: str = "") -> None:
+        """Let buttons be pressed whose devices are open."""
+        for each, (kinds, tip) in self._needing.items():
+            why = self.lacks(kinds)
+            if each in self._tips and why:  # what it was refused for is the same, or older
+                mark(each, "refused", False)
+                del self._tips[each]
+            if each not in self._tips:
+                each.setToolTip(f"{tip}. {why}" if why else tip)
+            each.setEnabled(not why)
 
     def asked(self, make: Callable[[], _T]) -> _T | None:
         """Return what a form asks for; None, and the reason shown, where that makes no sense."""

@@ -151,6 +151,10 @@ class LivePanel(Panel):
         self.form.buttons.insertWidget(0, self.whole_button)
         first = (self.live_button, self.snap_button, self.average, self.reconstruct_button)
         fill(row, *first, 10, light, None, across=True, spacing=6)
+        self.only_with(("camera",), self.live_button, self.snap_button)
+        for switch in self.light_buttons.buttons():
+            if switch.property("light") != LightState.DARK:  # which darkens what it can
+                self.only_with(("led_array",), switch)
 
     # Panel ---------------------------------------------------------------------------------------
     def as_python(self) -> str:
@@ -320,7 +324,9 @@ class LivePanel(Panel):
     # What the operator does ----------------------------------------------------------------------
     def toggle_live(self) -> None:
         """Run the camera, or hold the last frame."""
-        if self.session.viewing.wanted:
+        if why := self.lacks(("camera",)):
+            self.refused(None, why)
+        elif self.session.viewing.wanted:
             self.session.viewing.hold()
         else:
             self.session.viewing.start()
@@ -328,6 +334,9 @@ class LivePanel(Panel):
 
     def snap(self) -> None:
         """Take a photograph into the runs' folder."""
+        if why := self.lacks(("camera",)):
+            self.refused(None, why)
+            return
         if not self.average.submit():
             self.average.setFocus()
             return

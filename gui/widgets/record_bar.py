@@ -52,6 +52,7 @@ class RecordBar(QWidget):
         self._asked_s = 0.0
         tip = "Record every frame to the disk; again ends it (Ctrl+R)"
         self.button = button("● Record", tip, self.toggle)
+        panel.only_with(("camera",), self.button)
         self.seconds = NumberEdit("s", 10.0, minimum=0.01, tip="How long to record, seconds")
         self.seconds.setFixedWidth(80)
         panel.heed(self.seconds)
@@ -93,8 +94,8 @@ class RecordBar(QWidget):
             else:  # it waits for the camera, or has just begun
                 self.job.cancel()
             return
-        if not self._session.is_open("camera"):
-            self._panel.refused(self.button, "The camera is not connected.")
+        if why := self._panel.lacks(("camera",)):
+            self._panel.refused(None, why)
             return
         if not self.seconds.submit():
             self.seconds.setFocus()
@@ -143,6 +144,7 @@ class RecordBar(QWidget):
         self.look_button.hide()
         self._show_rest(False)
         self.button.setText("■ End")
+        self._panel.only_with((), self.button)  # whatever fails, it can be ended
         job.progressed.connect(self._show)
         job.succeeded.connect(self._done)
         job.failed.connect(lambda _: self._ended_early("by a fault"))
@@ -238,6 +240,7 @@ class RecordBar(QWidget):
     def _ended(self) -> None:
         self.job, self._recorder = None, None
         self.button.setText("● Record")
+        self._panel.only_with(("camera",), self.button)
         self.look_button.setVisible(self._taken is not None)
         self._look_at_disk()
 

@@ -36,9 +36,17 @@ def spoilt(saturated_share: float, n_pixels: int, light: LightState) -> bool:
 def switch_light(bench: Bench, light: LightState) -> None:
     """Light the scene, the point source, or nothing; ``AS_IS`` changes nothing.
 
+    What is darkened is darkened as far as it can be: the scene also where the point source has failed.
+
     Raises DeviceError or BenchError when a light cannot be switched.
     """
     if light is LightState.AS_IS:
+        return
+    if light is LightState.DARK:
+        try:
+            bench.source_off()
+        finally:
+            bench.scene_off()
         return
     bench.source_on() if light is LightState.SOURCE else bench.source_off()
     bench.scene_on() if light is LightState.SCENE else bench.scene_off()

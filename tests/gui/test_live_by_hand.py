@@ -236,3 +236,51 @@ def test_what_auto_could_not_do_is_over_with_another_exposure(qtbot: QtBot, live
     qtbot.waitUntil(lambda: not auto.property("refused"), timeout=WAIT_MS)
     assert live.session.bench.camera.exposure_ms == 7
     assert (auto.toolTip(), live._note.text()) == (tip, "")
+
+
+def test_what_needs_a_device_that_was_lost_cannot_be_pressed_and_says_why(
+    qtbot: QtBot, live: LivePanel
+) -> None:
+    session, bar = live.session, live.record_bar
+    buttons = live.live_button, live.snap_button, bar.button
+    tips = [each.toolTip() for each in buttons]
+    session.bench.shared["simulated"].unplug("camera")  # type: ignore[attr-defined]
+    qtbot.waitUntil(lambda: session.state("camera").condition == "failed", timeout=WAIT_MS)
+    for each, tip in zip(buttons, tips, strict=True):
+        assert not each.isEnabled()
+        assert each.toolTip().startswith(tip)
+        assert "unplugged" in each.toolTip()
+    for key in (Qt.Key.Key_K, Qt.Key.Key_R, Qt.Key.Key_L):
+        live.accepted()
+        qtbot.keyClick(live, key, CTRL)
+        assert "unplugged" in live._note.toolTip(), "by its key it is refused in words"
+    assert session.viewing.wanted
+    session.bench.shared["simulated"].plug_in("camera")  # type: ignore[attr-defined]
+    session.reconnect("camera")
+    qtbot.waitUntil(lambda: session.is_open("camera"), timeout=WAIT_MS)
+    assert [each.toolTip() for each in buttons] == tips
+    assert all(each.isEnabled() for each in buttons)
+    assert not live._note.text()
+
+
+def test_without_the_point_source_nothing_is_lit_but_the_scene_is_darkened(
+    qtbot: QtBot, live: LivePanel
+) -> None:
+    session = live.session
+    lights = {each.text(): each for each in live.light_buttons.buttons()}
+    qtbot.waitUntil(lambda: session.bench.scene_lit, timeout=WAIT_MS)
+    session.bench.shared["simulated"].unplug("led_array")  # type: ignore[attr-defined]
+    qtbot.mouseClick(lights["Source"], LEFT)
+    qtbot.waitUntil(lambda: session.state("led_array").condition == "failed", timeout=WAIT_MS)
+    for words in ("Scene", "Source"):
+        assert not lights[words].isEnabled()
+        assert "unplugged" in lights[words].toolTip()
+    assert session.bench.scene_lit
+    qtbot.mouseClick(lights["Dark"], LEFT)
+    qtbot.waitUntil(lambda: not session.bench.scene_lit, timeout=WAIT_MS)
+    qtbot.waitUntil(lambda: "LED array" in live._note.text(), timeout=WAIT_MS)
+    session.bench.shared["simulated"].plug_in("led_array")  # type: ignore[attr-defined]
+    session.reconnect("led_array")
+    qtbot.waitUntil(lights["Source"].isEnabled, timeout=WAIT_MS)
+    assert lights["Source"].toolTip() == "Light the point source"
+    assert not live._note.text(), "its cause is gone"
