@@ -301,17 +301,21 @@ def reconstruct_job(work: ReconstructionWork, context: JobContext) -> Written:
     prepared = request.prepare()
     n_planes = len(prepared.calibration.psfs) if isinstance(request, VolumeRequest) else 1
     outputs.check(n_planes * prepared.measurement.size)
-    expected = ""
+    expected = warned = ""
 
-    def told(words: str) -> None:
+    def foretell(words: str) -> None:
         nonlocal expected
-        expected += f"; {words}"
+        expected = f"; {words}"
 
-    keeper = checkpoint_for(work.kept_in, prepared, request, say=told)
+    def warn(words: str) -> None:
+        nonlocal warned
+        warned = f"; {words}"
+
+    keeper = checkpoint_for(work.kept_in, prepared, request, say=warn)
     context.report(SoFar(0.0, "Solving …", prepared))
     history: list[IterationRecord] = []
     share, note = 0.0, ""
-    foretold = Foretold(told, Like.of(prepared, request.options))
+    foretold = Foretold(foretell, Like.of(prepared, request.options))
 
     def watch(record: IterationRecord, present: Callable[[], npt.NDArray[np.float32]]) -> None:
         history.append(record)
@@ -322,7 +326,7 @@ def reconstruct_job(work: ReconstructionWork, context: JobContext) -> Written:
     def stage(done: float, what: str) -> None:
         nonlocal share, note
         foretold.stage(done, what)
-        share, note = done, what + expected
+        share, note = done, what + expected + warned
         context.offer(lambda: SoFar(share, note, prepared, None, tuple(history)))
 
     with foretold:
