@@ -38,6 +38,7 @@ CEILING = 0.9
 MOST_FRAMES = 20
 """After which an unsteady source is given up."""
 _DARK = 0.01  # of full scale: below this nothing lights the scene
+_ALONE = 0.1  # of the brightest pixel's light: its neighbours have more where light made it bright
 _DIMMEST_USABLE = 0.05  # of full scale: below this a PSF drowns in read noise
 
 
@@ -54,6 +55,8 @@ class ExposureOutcome(Enum):
     """Nothing saturates, but the percentile stays below its target: a longer exposure would saturate."""
     TOO_DARK = "too dark"
     """The longest exposure that the camera allows leaves the percentile below its target."""
+    NO_LIGHT = "found no light"
+    """Nothing but a pixel that stands alone, a hot one, is bright: the exposure is as it was before."""
     TOO_BRIGHT = "too bright"
     """The shortest exposure that the camera allows still brings a pixel above the ceiling."""
     UNSTEADY = "unsteady"
@@ -101,7 +104,7 @@ class AutoExposure:
         last = self.trace[-1]
         frames = "1 frame" if len(self.trace) == 1 else f"{len(self.trace)} frames"
         found = (
-            f"{self.exposure_ms:.4g} ms after {frames}: "
+            f"{last.exposure_ms:.4g} ms after {frames}: "
             f"{PERCENTILE:g}th percentile at {last.level:.0%} of full scale (target {self.target:.0%}), "
             f"brightest pixel at {last.brightest:.0%}"
         )
@@ -113,6 +116,10 @@ class AutoExposure:
             ExposureOutcome.TOO_DARK: (
                 " This is the camera's longest exposure: raise the source's brightness or the gain, "
                 "or bring the source nearer."
+            ),
+            ExposureOutcome.NO_LIGHT: (
+                " That pixel stands alone: it is hot, and nothing else is bright. Light the scene or the "
+                "point source; the exposure is as it was before."
             ),
             ExposureOutcome.TOO_BRIGHT: (
                 f" This is the camera's shortest exposure, and {last.saturated_pixels} pixels saturate: "
@@ -150,7 +157,8 @@ def auto_expose(
 
     The response of a sensor is linear, so one unsaturated frame with signal predicts the exposure and a
     second one confirms it. A saturated frame says only "shorter": the exposure is halved, then quartered,
-    and so on, until nothing saturates. The camera is left at the exposure returned.
+    and so on, until nothing saturates. The camera is left at the exposure returned: the one it had where only
+    a hot pixel that is not known is bright.
 
     Parameters
     ----------
@@ -171,7 +179,7 @@ def auto_expose(
     if not 0.0 < target <= CEILING:
         raise ValueError(f"The target is above 0 and at most {CEILING:g} of full scale, not {target:g}.")
     shortest, longest = camera.exposure_limits_ms
-    exposure = camera.set_exposure_ms(float(np.clip(camera.exposure_ms, shortest, longest)))
+    exposure = before = camera.set_exposure_ms(float(np.clip(camera.exposure_ms, shortest, longest)))
     known_dark, known_saturated = 0.0, float("inf")  # bracket: longest without, shortest with saturation
     saturated_in_a_row = 0
     trace: list[ExposureTrial] = []
@@ -181,7 +189,8 @@ def auto_expose(
         return AutoExposure(exposure, outcome, tuple(trace), target, n_hot)
 
     while True:
-        trial = measure_exposure(camera.snap(), exposure, hot)
+        frame = camera.snap()
+        trial = measure_exposure(frame, exposure, hot)
         trace.append(trial)
         if trial.saturated_pixels or trial.brightest > CEILING:
             if exposure <= shortest * (1 + 1e-6):
@@ -189,6 +198,9 @@ def auto_expose(
         elif abs(trial.level - target) <= TOLERANCE * target:
             return result(ExposureOutcome.REACHED)
         elif trial.level < target and trial.brightest >= CEILING * (1 - TOLERANCE):
+            if hot is None and trial.level < _DARK and _stands_alone(frame):
+                exposure = camera.set_exposure_ms(before)
+                return result(ExposureOutcome.NO_LIGHT)
             return result(ExposureOutcome.HELD_BY_BRIGHTEST_PIXEL)
         elif trial.level < target and exposure >= longest * (1 - 1e-6):
             return result(ExposureOutcome.TOO_DARK)
@@ -234,6 +246,16 @@ def measure_exposure(
         brightest=(brightest - black) / span,
         saturated_pixels=int(histogram[frame.full_scale :].sum()),
     )
+
+
+def _stands_alone(frame: Frame) -> bool:
+    """Whether the brightest pixel's neighbours, two to each side, are dark: light falls on several."""
+    grey = frame.image if frame.image.ndim == 2 else frame.image.max(axis=2)
+    row, column = np.unravel_index(int(grey.argmax()), grey.shape)
+    around = grey[max(0, row - 2) : row + 3, max(0, column - 2) : column + 3]
+    black = frame.metadata.black_level
+    second = float(np.sort(around, axis=None)[-2])
+    return second - black < _ALONE * (float(grey[row, column]) - black)
 
 
 def _linear_step(trial: ExposureTrial, target: float) -> float:

@@ -270,6 +270,13 @@ class LivePanel(Panel):
         by = f", taken by: {holder.title}" if holder is not None else ""
         return self.session.describe_frame(frame.metadata) + by
 
+    @property
+    def _exposure_ms(self) -> float:
+        """How long the frame to come is exposed: as that before, or as the camera is set now."""
+        frame, state = self.picture.frame, self.form.state
+        before_ms = 0.0 if frame is None else frame.metadata.exposure_ms
+        return max(before_ms, 0.0 if state is None else state.exposure_ms)
+
     def _judge_age(self, frame: Frame) -> None:
         """Veil a picture that is not of now, and say since when."""
         age_s = (time.monotonic_ns() - frame.metadata.host_time_ns) / 1e9
@@ -285,12 +292,11 @@ class LivePanel(Panel):
         if stuck:
             self.status.setText(f"The live view does not start: {stuck}")
             return True
-        frame = self.picture.frame
-        exposure_s = 0.0 if frame is None else frame.metadata.exposure_ms / 1e3
+        frame, state = self.picture.frame, self.form.state
+        longest_s = self._exposure_ms / 1e3
         seconds = time.monotonic() - self._came_s
-        if not self.session.live.is_running or seconds < _PATIENCE_S + 3 * exposure_s:
+        if not self.session.live.is_running or seconds < _PATIENCE_S + 3 * longest_s:
             return False
-        state = self.form.state
         words = f"Waiting for {'the first' if frame is None else 'a'} frame for {seconds:.0f} s."
         if state is not None and state.trigger_mode != "free_run":
             by = f"pulse on {state.trigger_line}" if state.trigger_mode == "hardware" else "program's trigger"

@@ -159,6 +159,19 @@ def test_darkness_ends_at_the_longest_exposure() -> None:
     assert auto_expose(LinearCamera(np.zeros(SHAPE))).outcome is ExposureOutcome.TOO_DARK
 
 
+def test_a_hot_pixel_in_the_dark_is_no_light_and_the_exposure_stays() -> None:
+    dark = np.zeros(SHAPE)
+    dark[60, 80] = 0.5
+    camera = LinearCamera(dark, 20.0)
+    result = auto_expose(camera)
+    assert result.outcome is ExposureOutcome.NO_LIGHT
+    assert not result.usable
+    assert (result.exposure_ms, camera.exposure_ms) == (20.0, 20.0)
+    assert "hot" in result.message
+    dark[60, 81] = 0.2  # as a spot of light has neighbours
+    assert auto_expose(LinearCamera(dark, 20.0)).outcome is ExposureOutcome.HELD_BY_BRIGHTEST_PIXEL
+
+
 def test_a_flickering_source_is_given_up_and_named() -> None:
     camera = LinearCamera(caustic(), flicker=lambda frame: (1.0, 0.3)[frame % 2])
     result = auto_expose(camera)
