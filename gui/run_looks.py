@@ -62,9 +62,7 @@ def look_into(path: Path, *, read: bool = False, on_progress: Progress | None = 
         looked = verify(run, on_progress, read=read)
         about = _about_run(run, looked)
         if read:
-            about.insert(
-                1, f"{looked.frames} of {len(run.records)} frames read back are as they were written"
-            )
+            about.insert(1, f"{looked.frames} of {_taken(looked)} frames read back are as they were written")
         held = (SWEEP.kept(path), PHOTOGRAPH.kept(path))
         to_use = next((each for each in held if each.exists()), None)
         return Opened(path, run, sorted(run.records), about, can_go_on(run, looked), to_use)
@@ -124,7 +122,8 @@ def _about_photograph(path: Path) -> list[str]:
 
 def _about_run(run: Run, looked: Verification) -> list[str]:
     """Return what is known of a run, a line each."""
-    lines = [f"{looked.became}: {len(run.records)} of {run.n_frames} frames taken"]
+    lines = [f"{looked.became}: {_taken(looked)} of {run.n_frames} frames taken"]
+    lines[0] += f", {len(run.unlisted)} of them without metadata" if run.unlisted else ""
     lines[0] += "  SIMULATED" if run.is_simulated else ""
     if run.error:
         lines.append(run.error)
@@ -143,6 +142,11 @@ def _about_run(run: Run, looked: Verification) -> list[str]:
     if SWEEP.is_of(run.path):
         lines += _calibration_lines(run.path)
     return [*lines, str(run.path)]
+
+
+def _taken(looked: Verification) -> int:
+    """Return how many images there should be, with those whose line in the log is lost."""
+    return looked.frames + len(looked.damaged)
 
 
 def _calibration_lines(run: Path) -> list[str]:

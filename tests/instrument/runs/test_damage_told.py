@@ -13,12 +13,13 @@ from calibration_routines.routine import routines
 from instrument.cli import main
 from instrument.files.calibration_file import save_calibration
 from instrument.files.images import write_image
-from instrument.runs.acquire import look
+from instrument.runs.acquire import look, settle
 from instrument.runs.results import PHOTOGRAPH_FILE, RESULT_FILES
-from instrument.runs.run import Run
+from instrument.runs.run import FinishReason, Run
 from instrument.runs.run_files import FRAMES, RunError
 from recon.types import Calibration
 from tests.instrument.runs.damages import DAMAGES, anothers, deleted, newer, older, one_bit, truncated, zeroed
+from tests.instrument.runs.test_store import frame, new_run
 
 pytestmark = pytest.mark.usefixtures("mock_drivers")
 
@@ -188,3 +189,25 @@ def test_the_window_tells_a_damaged_calibration_in_the_words_of_verify(
     (words,) = look(path).lines()
     for read in (False, True):
         assert f"DAMAGED: {words}" in window.look_into(path, read=read).about
+
+
+def test_the_window_counts_images_without_a_line_as_verify_does(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    window = pytest.importorskip("gui.run_looks")
+    with new_run(tmp_path, plan=None) as writer:
+        writer.start()
+        writer.write([frame(i) for i in range(4)])
+        path = writer.finish(FinishReason.COMPLETED).path
+    log = path / "log.jsonl"
+    data = bytearray(log.read_bytes())
+    data[data.index(b'"frame", "index": 3') + 20] = 7
+    log.write_bytes(data)
+    settle(path)
+    about = window.look_into(path, read=True).about
+    assert about[0].startswith("completed: 4 of 4 frames taken, 1 of them without metadata")
+    assert about[1] == "4 of 4 frames read back are as they were written"
+    assert main(["verify", str(path)]) == 0
+    assert "4 of 4 frames read back" in capsys.readouterr().out
+    one_bit(path / f"{FRAMES}/0/c/3/0/0", path)
+    assert "3 of 4 frames read back are as they were written" in window.look_into(path, read=True).about
