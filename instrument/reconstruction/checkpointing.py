@@ -179,7 +179,8 @@ class CheckpointFolder:
         self._every_s, self._say, self._is_said = every_s, say, False
         self._written = time.monotonic()
         self._resumed: dict[str, int] = {}
-        self._kept = False
+        self._kept: set[str] = set()
+        """Parts whose state is there, of this run or of the one that it goes on from."""
         self.left_aside: tuple[str, ...] = ()
         problem = plain(dict(problem))
         if folder.exists() and not folder.is_dir():
@@ -206,7 +207,7 @@ class CheckpointFolder:
         """Restore what was kept of a part, if anything, and return its history so far."""
         path = self._path(part)
         if not path.is_file():
-            if not self._resumed and not self._kept:
+            if not self._kept:
                 self.left_aside = tuple(sorted(other.name for other in self.folder.glob("*.npz")))
             return ()
         try:
@@ -224,6 +225,7 @@ class CheckpointFolder:
                 path, f"cannot be read as a checkpoint ({error}).", "Delete it to start over."
             ) from None
         self._resumed[part] = len(records)
+        self._kept.add(part)
         return records
 
     def keep(self, part: str, solver: Solver, history: Sequence[IterationRecord], *, ended: bool) -> None:
@@ -239,7 +241,6 @@ class CheckpointFolder:
             f"{_STATE}{name}": value for name, value in _flat(solver.checkpoint(copy=False)).items()
         }
         state[_HISTORY] = np.array([astuple(record) for record in history])
-        self._written = time.monotonic()
         try:
             if not (self.folder / PROBLEM).is_file():  # states alone would be taken for any problem's
                 raise FileError(self.folder, "was deleted or moved meanwhile.")
@@ -248,14 +249,20 @@ class CheckpointFolder:
         except (OSError, FileError) as error:
             self._cannot_keep(error)
         else:
-            self._kept, self.failed = True, ""
+            self._kept.add(part)
+            self.failed = ""
+        finally:
+            self._written = time.monotonic()
 
     def _cannot_keep(self, error: OSError | FileError) -> None:
         reason = str(error) if isinstance(error, FileError) else f"{self.folder}: {os_reason(error)}"
-        self.failed = f"not kept: {reason}"
+        stays = (self.folder / PROBLEM).is_file() and any(self._path(part).is_file() for part in self._kept)
+        left = "what was kept before stays, and the same again goes on from there." if stays else ""
+        self.failed = f"not kept: {reason} {left.capitalize()}".rstrip()
         if not self._is_said:
             self._is_said = True
-            self._say(f"Warning: {reason} The work goes on; what it has done is not kept for another time.")
+            nothing = "what it has done is not kept for another time."
+            self._say(f"Warning: {reason} The work goes on; {left or nothing}")
 
     def remove(self) -> tuple[str, ...]:
         """Delete what was kept, as there is nothing left to go on with; return what else the folder holds.

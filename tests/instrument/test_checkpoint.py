@@ -1,7 +1,7 @@
 """Reconstructions that are kept in a folder and gone on with."""
 
-import errno
 import json
+import resource
 import shutil
 
 import numpy as np
@@ -248,20 +248,20 @@ def test_a_checkpoint_that_cannot_be_kept_on_costs_no_result(files, run, monkeyp
     """What the folder's loss would take is the picture itself; that it is lost is said once."""
     kept, out, whole = files / "kept", files / "a.tif", files / "b.tif"
     keep, calls = CheckpointFolder.keep, []
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
 
     def keeping(*given, **named):
         calls.append(given)
-        if len(calls) == 3:
-            if lost == "deleted":
-                shutil.rmtree(kept)
-            elif lost == "moved":
-                kept.rename(files / "elsewhere")
-            else:
-                monkeypatch.setattr(np, "savez", no_space)
-        keep(*given, **named)
-
-    def no_space(*_, **__):
-        raise OSError(errno.ENOSPC, "No space left on device")
+        if len(calls) == 3 and lost == "deleted":
+            shutil.rmtree(kept)
+        elif len(calls) == 3 and lost == "moved":
+            kept.rename(files / "elsewhere")
+        if len(calls) >= 3 and lost == "full":
+            resource.setrlimit(resource.RLIMIT_FSIZE, (1000, limits[1]))
+        try:
+            keep(*given, **named)
+        finally:
+            resource.setrlimit(resource.RLIMIT_FSIZE, limits)
 
     what = ("--psf", files / "psf.tif", "-n", 8)
     assert run(*what, "-o", whole)[0] == 0
@@ -270,13 +270,42 @@ def test_a_checkpoint_that_cannot_be_kept_on_costs_no_result(files, run, monkeyp
     code, said = run(*what, "--checkpoint", kept, "-o", out)
     assert code == 0, said
     assert len(calls) > 3
-    assert said.count("The work goes on; what it has done is not kept for another time.") == 1
-    reason = "no space left" if lost == "full" else "was deleted or moved meanwhile"
-    assert said.count(reason) == 2, "at once, and in the end"
+    assert said.count("The work goes on; ") == 1
+    reason = "file too large" if lost == "full" else "was deleted or moved meanwhile"
+    assert said.lower().count(reason) == 2, "at once, and in the end"
     assert "goes on from it" not in said
+    assert said.count("what it has done is not kept for another time.") == (lost != "full")
+    assert said.count("the same again goes on from there.") == 2 * (lost == "full"), "at once, and in the end"
     expected = tifffile.imread(whole)
     assert tifffile.imread(out) == pytest.approx(expected, abs=1e-5 * float(expected.max()))
     assert kept.exists() == (lost == "full")
+    if lost == "full":
+        monkeypatch.setattr(CheckpointFolder, "keep", keep)
+        code, said = run(*what, "--checkpoint", kept, "-o", out)
+        assert code == 0, said
+        assert "from iteration 2" in said
+
+
+def test_the_time_that_writing_takes_does_not_count_to_the_next(tmp_path, monkeypatch):
+    """Where a disk is slow every iteration was written."""
+    clock, written = [0.0], []
+    savez = np.savez
+
+    def slow(*given, **named):
+        written.append(given)
+        clock[0] += 100.0
+        savez(*given, **named)
+
+    monkeypatch.setattr("instrument.reconstruction.checkpointing.time.monotonic", lambda: clock[0])
+    monkeypatch.setattr(np, "savez", slow)
+    keeper = CheckpointFolder(tmp_path / "kept", {}, every_s=60.0)
+    running = solver()
+    records = running.run(StoppingRules(iterations=2)).history
+    clock[0] += 61.0
+    for _ in range(3):
+        clock[0] += 1.0
+        keeper.keep("", running, records, ended=False)
+    assert len(written) == 1
 
 
 def test_only_what_was_kept_is_removed(files, run):
