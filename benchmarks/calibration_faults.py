@@ -176,8 +176,11 @@ def _but_for_brightness(found: Array, usual: Array) -> float:
 
 
 def _of_slides(found: Array, usual: Array) -> float:
-    """Return the largest change of a photograph: a slide's brightness is its own."""
-    return max(_but_for_brightness(one, other) for one, other in zip(found, usual, strict=True))
+    """Return the largest change of a photograph: a slide's brightness and place are its own."""
+    pairs = list(zip(found, usual, strict=True))
+    changes = [compare(one.astype(np.float32), other.astype(np.float32)) for one, other in pairs]
+    there = [moved(one, -c.rows, -c.columns) for (one, _), c in zip(pairs, changes, strict=True)]
+    return max(_but_for_brightness(one, other) for one, (_, other) in zip(there, pairs, strict=True))
 
 
 def _of_psfs(found: Array, usual: Array) -> float:
