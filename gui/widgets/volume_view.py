@@ -115,7 +115,7 @@ class VolumeView(QWidget):
         self.turning.opened.connect(self._measure_again)
         self.views, self.stack = QWidget(), QStackedWidget()
         self.measure = Measure(self.front)
-        self.tools.measure.toggled.connect(self.measure.set_on)
+        self.tools.measure.toggled.connect(self._measure_or_not)
         self.measure.chosen.connect(self._measured)
         self.tools.proportions.toggled.connect(self._look)
         self.measured = label(role="value", selectable=True, wraps=True)
@@ -338,19 +338,28 @@ class VolumeView(QWidget):
             return
         self._load_renderer()
         pitch_um = None if self._planes is None else middle_pitch_um(self._planes)
-        where = f"plane {self.point[0] + 1}" if self.mode == "slices" else "brightest over depth"
+        slices = self.mode == "slices"
+        where = f"plane {self.slices['z'].index + 1}" if slices else "brightest over depth"
         words = f"{where}, {region_words(region, grey(shown), self._source.shape[1:], pitch_um)}"
         if (renderer := self.turning.renderer) is not None:
             along = renderer.along_depth(region.rows, region.columns)
             best = int(along.argmax())
             words += f"; most along depth at plane {best + 1}{self._depth_words(best)}"
             self._along.setData(np.arange(1, len(along) + 1), along.astype(float))
-            if self.mode == "slices":
+            if slices:
                 self._titles[3].setText("mean of the region along depth")
         self.measured.setText(words)
-        self.measured.show()
+        self.measured.setVisible(self.mode != "turning")
+
+    def _measure_or_not(self, on: bool) -> None:
+        self.measure.set_on(on)
+        if not on:
+            self.measured.clear()
+            self.measured.hide()
+            self._show()  # the profile is the point's again
 
     def _measure_again(self) -> None:
+        """Measure the same region of what is in front now."""
         if self.measure.regions:
             self._measured(self.measure.regions[-1])
 
@@ -381,6 +390,7 @@ class VolumeView(QWidget):
             self._name_slices()
             if held.axis == "y":
                 self._show_profile()
+            self._measure_again()
 
     def _show(self) -> None:
         if self._source is None:
@@ -393,6 +403,7 @@ class VolumeView(QWidget):
             self._show_slices()
         elif self.projections is not None:
             self._show_projections(self.projections)
+        self._measure_again()
 
     def _show_projections(self, p: Projections) -> None:
         levels, colours_spared = self.levels.levels, spares_hues(self.levels.colour_map)

@@ -52,8 +52,18 @@ def test_a_volume_is_turned_stepped_through_and_measured(qtbot: QtBot) -> None:
     view.measure._dragged(QPointF(12, 12), QPointF(21, 16))
     assert "10 x 5 at 12, 12 pixels (250 µm x 125 µm): mean 3" in view.measured.text()
     assert "most along depth at plane 6" in view.measured.text()
+    view.go_to(3, 15, 20)  # nothing is there
+    qtbot.waitUntil(lambda: "mean 0," in view.measured.text(), timeout=WAIT_MS)
+    assert view.measured.text().startswith("plane 4,"), "the figures are those of the plane in front"
+    assert view._titles[3].text() == "mean of the region along depth"
+    view.set_mode("brightest")
+    assert view.measured.text().startswith("brightest over depth, 10 x 5 at 12, 12")
+    assert "mean 3" in view.measured.text()
+    view.set_mode("slices")
     view.tools.measure.setChecked(False)
     assert not view.measure.regions
+    assert view.measured.isHidden()
+    assert "along depth at" in view._titles[3].text(), "no figures of a region that is gone"
     view.release()
     qtbot.waitUntil(lambda: not jobs.jobs, timeout=WAIT_MS)
 
