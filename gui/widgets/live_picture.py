@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import pyqtgraph as pg
@@ -25,6 +25,9 @@ from instrument.live.frame_view import (
     percentiles,
     sensor_roi,
 )
+
+Moved = Callable[[float, float], tuple[float, float] | None]
+"""Gives where a place of the frame before, in its pixels, is in another frame; None: nowhere in it."""
 
 
 class CrossHair(QObject):
@@ -58,6 +61,18 @@ class CrossHair(QObject):
         if enabled and self.pixel is None and self._view.image is not None:
             height, width = self._view.image.shape[:2]
             self.move_to(width // 2, height // 2)
+
+    def follow(self, moved: Moved) -> None:
+        """Move it with the sensor's pixels; to the middle where it would be out of the image."""
+        assert self.pixel is not None
+        place, self.pixel = moved(*(side + 0.5 for side in self.pixel)), None
+        if not self.enabled:
+            return  # it is shown in the middle when it is wanted again
+        if place is None:
+            self.set_enabled(True)
+        else:
+            self.pixel = int(place[0]), int(place[1])
+            self.step(0, 0)
 
     def step(self, across: float, down: float) -> None:
         """Move it by so many pixels, at least one, and not out of the image."""
@@ -98,6 +113,11 @@ class _Overlay:
             self._view.box.removeItem(self.item)
             self.item = None
 
+    def begin_anew(self) -> None:
+        """Show it where it begins."""
+        self.set_enabled(False)
+        self.set_enabled(True)
+
     def _made(self, width: int, height: int) -> Any:
         raise NotImplementedError
 
@@ -113,22 +133,33 @@ class ProfileLine(_Overlay):
         """Move the line by steps of the arrow keys, or only its second end."""
         if self.item is None:
             return
-        ends = [
-            self.item.mapToParent(self.item.mapFromItem(handle["item"], 0, 0)) for handle in self.item.handles
-        ]
+        ends = self._places()
         for end in ends[1:] if end_only else ends:
             end.setX(end.x() + _STEP_PX * across)
             end.setY(end.y() + _STEP_PX * down)
         for handle, end in zip(self.item.handles, ends, strict=True):
             self.item.movePoint(handle["item"], end)
 
+    def _places(self) -> list[Any]:
+        return [
+            self.item.mapToParent(self.item.mapFromItem(handle["item"], 0, 0)) for handle in self.item.handles
+        ]
+
+    def follow(self, moved: Moved) -> None:
+        """Move its ends with the sensor's pixels; where one would be out of the image it begins anew."""
+        places = [moved(end.x(), end.y()) for end in self._places()]
+        if None in places:
+            self.begin_anew()
+            return
+        for handle, place in zip(self.item.handles, places, strict=True):
+            self.item.movePoint(handle["item"], pg.Point(*place))
+
     @property
     def ends(self) -> tuple[tuple[float, float], tuple[float, float]] | None:
         """Start and end, x and y in pixels; None while hidden."""
         if self.item is None:
             return None
-        (_, a), (_, b) = self.item.getSceneHandlePositions()
-        first, second = self._view.box.mapSceneToView(a), self._view.box.mapSceneToView(b)
+        first, second = self._places()  # not by the scene, which follows a frame of another size later
         return (first.x(), first.y()), (second.x(), second.y())
 
 
@@ -196,6 +227,10 @@ _MOVED = 0.1
 """Of the span of the levels: from here on a frame is shown again by its own."""
 
 
+_PROFILE_PX = 110
+"""The least that a profile is seen on: its numbers stand apart."""
+
+
 class LivePicture(QWidget):
     """A frame with tools above it, the profile along a line below, and its histogram.
 
@@ -226,6 +261,8 @@ class LivePicture(QWidget):
         super().__init__(parent)
         self.frame: Frame | None = None
         self._measured: Frame | None = None
+        self._shape: tuple[int, ...] = ()
+        """Of the frame that line, cross-hair and region were drawn on last."""
         self.is_coarse = False
         self.levels = (0.0, 1.0)
         self._session = session
@@ -248,6 +285,7 @@ class LivePicture(QWidget):
         self.profile_plot = plot_widget("along the line", "counts", x_unit="pixels")
         self._profile_curve = self.profile_plot.plot([], [], pen=curve_pen(0))
         self.profile_plot.setMaximumHeight(170)
+        self.profile_plot.setMinimumHeight(_PROFILE_PX)
         self.profile_plot.hide()
         yield
         self.colour_map = choice(NAMES, "Colour map; saturated pixels have a colour of their own")
@@ -307,9 +345,12 @@ class LivePicture(QWidget):
         self.frame, self.is_coarse = frame, False
         if (before := self._measured) is not None and before is not frame and _other_light(before, frame):
             self._measure(frame)
-        top, left = frame.metadata.roi[:2]
+        before, (top, left) = self.view.naming, frame.metadata.roi[:2]
         self.view.naming = (left, top, frame.metadata.binning)
         self.view.show_image(frame.image, *self.levels, frame.full_scale)
+        if self.view.naming != before or frame.image.shape[:2] != self._shape:
+            self._follow(before, frame)
+            self._shape = frame.image.shape[:2]
 
     def show_coarse(self, counts: Counts, factor: int) -> None:
         """Show what a frame will show, of large pixels, where it will stand; it is no frame."""
@@ -357,6 +398,23 @@ class LivePicture(QWidget):
         return f"region {', '.join(map(str, sensor_roi(frame.metadata, *rectangle).as_tuple()))}"
 
     # Inside --------------------------------------------------------------------------------------
+    def _follow(self, before: tuple[int, int, int], frame: Frame) -> None:
+        """Leave line and cross-hair where they were on the sensor; outside, as a region, they begin anew."""
+        height, width = frame.image.shape[:2]
+        places = before, self.view.naming
+
+        def moved(x: float, y: float) -> tuple[float, float] | None:
+            (left, top, fine), (new_left, new_top, coarse) = places
+            x, y = (x * fine + left - new_left) / coarse, (y * fine + top - new_top) / coarse
+            return (x, y) if 0 <= x <= width and 0 <= y <= height else None
+
+        if self.profile_line.item is not None:
+            self.profile_line.follow(moved)
+        if self.cross_hair.pixel is not None:
+            self.cross_hair.follow(moved)
+        if self.region_box.item is not None:
+            self.region_box.begin_anew()
+
     def _measure(self, frame: Frame) -> None:
         self._measured = frame
         counts = histogram(frame.image)
@@ -369,9 +427,7 @@ class LivePicture(QWidget):
         if (ends := self.profile_line.ends) is not None:
             self._profile_curve.setData(*line_profile(frame.image, *ends))
             (x0, y0), (x1, y1) = (self.view.named(*end) for end in ends)
-            words = (
-                f"along the line from x {x0:.0f} y {y0:.0f} to x {x1:.0f} y {y1:.0f} of the sensor (pixels)"
-            )
+            words = f"x {x0:.0f} y {y0:.0f} to x {x1:.0f} y {y1:.0f} of the sensor (pixels)"
             self.profile_plot.setLabel("bottom", words)
 
     def _stretch_chosen(self) -> None:

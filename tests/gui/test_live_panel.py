@@ -16,6 +16,7 @@ from PySide6.QtGui import QColor
 from PySide6.QtWidgets import QComboBox, QLineEdit
 from pytestqt.qtbot import QtBot
 
+from drivers.camera import Roi
 from drivers.device import OwnSetting
 from drivers.errors import DeviceError, LimitError
 from gui.main_window import MainWindow
@@ -605,6 +606,26 @@ def test_profile_and_cross_hair_follow_the_frame(qtbot: QtBot, live: LivePanel) 
     qtbot.mouseClick(live.picture.cross_button, Qt.MouseButton.LeftButton)
     live.picture.view.clicked.emit(7, 9)
     qtbot.waitUntil(lambda: "x 7  y 9" in live.status.text(), timeout=WAIT_MS)
+
+
+def test_line_and_cross_hair_keep_their_place_on_the_sensor_in_another_region(
+    qtbot: QtBot, live: LivePanel
+) -> None:
+    picture = live.picture
+    for switch in (picture.profile_button, picture.cross_button):
+        qtbot.mouseClick(switch, Qt.MouseButton.LeftButton)
+    picture.view.clicked.emit(100, 90)
+    for roi, place, ends in (
+        (Roi(60, 20, 120, 300), (80, 30), [(12, 60), (268, 60)]),  # both are inside
+        (Roi(60, 80, 20, 40), (20, 10), [(4, 10), (36, 10)]),  # neither: the line begins anew, in the middle
+    ):
+        live.form.set_region(roi)
+        qtbot.waitUntil(
+            lambda roi=roi: picture.frame is not None and picture.frame.metadata.roi == roi.as_tuple(),
+            timeout=WAIT_MS,
+        )
+        assert picture.cross_hair.pixel == place
+        assert picture.profile_line.ends == pytest.approx(np.array(ends), abs=0.6)
 
 
 def test_levels_follow_percentiles_of_the_raw_data(qtbot: QtBot, live: LivePanel) -> None:
