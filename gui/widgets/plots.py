@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import re
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -21,6 +22,9 @@ from instrument.live.frame_view import FrameFigures, grouped
 
 # Images are (row, column) here as everywhere else in the project.
 pg.setConfigOptions(imageAxisOrder="row-major", antialias=True)
+
+
+_DECIMAL = re.compile(r"-?\d+(\.\d+)?")
 
 
 class _Plot(pg.PlotWidget):  # type: ignore[misc] # pyqtgraph has no type annotations
@@ -45,7 +49,31 @@ class _Plot(pg.PlotWidget):  # type: ignore[misc] # pyqtgraph has no type annota
         self.setLabel("left", _label(y_label, y_unit))
 
 
-class _Counts(pg.AxisItem):  # type: ignore[misc] # pyqtgraph has no type annotations
+class _Axis(pg.AxisItem):  # type: ignore[misc] # pyqtgraph has no type annotations
+    """An axis whose numbers all have as many digits behind the point as the finest of them needs."""
+
+    _places: int | None = None
+
+    def generateDrawSpecs(self, painter: QPainter) -> Any:  # noqa: N802 - pyqtgraph's name
+        """Return what is drawn: once more where coarse and fine ticks came with digits of their own."""
+        self._places = None
+        specs = super().generateDrawSpecs(painter)
+        texts = [text for _, _, text in specs[2]] if specs is not None else []
+        if self._tickLevels is None and all(_DECIMAL.fullmatch(text) for text in texts):
+            places = {len(text.partition(".")[2]) for text in texts}
+            if len(places) > 1:
+                self._places = max(places)
+                specs = super().generateDrawSpecs(painter)
+        return specs
+
+    def tickStrings(self, values: Sequence[float], scale: float, spacing: float) -> list[str]:  # noqa: N802
+        """Return the numbers beside ticks."""
+        if self._places is None:
+            return list(super().tickStrings(values, scale, spacing))
+        return [f"{value * scale:.{self._places}f}" for value in values]
+
+
+class _Counts(_Axis):
     """An axis of things that are counted: nothing stands between two of them."""
 
     def tickSpacing(self, least: float, most: float, size: float) -> list[tuple[float, float]]:  # noqa: N802
@@ -67,7 +95,8 @@ def plot_widget(
 
     pyqtgraph has no type annotations, hence ``Any``.
     """
-    plot = _Plot(enableMenu=False, axisItems={"bottom": _Counts("bottom")} if counts else None)
+    axes = {"bottom": _Counts("bottom") if counts else _Axis("bottom"), "left": _Axis("left")}
+    plot = _Plot(enableMenu=False, axisItems=axes)
     plot.setFocusPolicy(Qt.FocusPolicy.NoFocus)
     plot.restyle()
     # Room for letters below the line, and for the half of a number that stands at an axis' end.
