@@ -230,7 +230,7 @@ def judged(
 ) -> Reconstruction:
     """Return the result with a verdict on whether to trust it and whether the calibration is its own.
 
-    Where the PSF goes on beyond the sensor and the scene needs what it lacks, the result is not reliable.
+    Where the PSF seems to go on beyond the sensor and the scene needs what it lacks, the result is doubtful.
     At the cost of about two iterations, and of a hundred on few pixels; where no known case tells, of a third
     of the iterations more, for pixels that are held out.
 
@@ -251,20 +251,20 @@ def judged(
     tell(0.0, "judging the result")
     verdict, said = _verdict(small, problem, started=started)
     if verdict is not None:
+        what = "The calibration was not checked"
         try:
             check = check_calibration(problem, on_stage=tell)
             verdict = verdict if check is None else verdict.with_calibration(check)
+            what = "Whether the PSF lacks light that the picture needs was not looked at"
             missing = lacking(small, problem)
             if missing is not None and missing.much:
                 verdict = verdict.with_cut_psf(missing.of_all / (1 + missing.of_all))
+            what = "No pixels were held out"
             if unlike_any(verdict):
                 missed = held_out_error(small, problem, on_stage=tell, cancel=cancel)
                 verdict = replace(verdict, held_out=missed)
         except Exception as error:  # noqa: BLE001 - the verdict says what it says without it
-            said = (
-                *said,
-                f"The calibration was not checked: {error}",
-            )
+            said = (*said, f"{what}: {error}")
     tell(1.0, "judged")
     uncertainty = result.uncertainty
     if uncertainty is not None and verdict is not None and verdict.calibration is not None:

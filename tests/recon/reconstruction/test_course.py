@@ -122,15 +122,22 @@ def test_the_plan_counts_what_solvers_of_volumes_take():
         assert plan.total == pytest.approx(_peak(problem), rel=0.1), (prior, planes)
 
 
-def test_an_error_in_the_check_of_the_calibration_leaves_the_verdict(monkeypatch):
+@pytest.mark.parametrize(
+    ("part", "what"),
+    [
+        ("check_calibration", "The calibration was not checked"),
+        ("lacking", "Whether the PSF lacks light that the picture needs was not looked at"),
+    ],
+)
+def test_an_error_in_a_part_of_judging_leaves_the_verdict_and_says_which(monkeypatch, part, what):
     def broken(*_arguments, **_options):
         raise ZeroDivisionError("a decoy without light")
 
-    monkeypatch.setattr(door, "check_calibration", broken)
+    monkeypatch.setattr(door, part, broken)
     scene = make_scene("text", size=24)
     result = reconstruct(scene.measurement, scene.calibration, iterations=5)
     assert result.verdict is not None
-    assert any("a decoy without light" in warning for warning in result.warnings)
+    assert f"{what}: a decoy without light" in result.warnings
 
 
 def history(unrest, each_s=0.1, n=TOLD_AT):
