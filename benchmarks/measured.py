@@ -26,7 +26,7 @@ import numpy.typing as npt
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from benchmarks.measured_blind import blind
-from benchmarks.measured_labs import cut, labs
+from benchmarks.measured_labs import cut, cut_drawn, labs
 from benchmarks.measured_scenes import load, ramp
 from benchmarks.measured_speed import speed
 from benchmarks.measured_variants import coarse_pairs, dark_levels, variants
@@ -257,6 +257,7 @@ SECTIONS: Mapping[str, tuple[str, Callable[[Path], list[str]]]] = {
     "blind": ("The hand as a stranger gives it", blind),
     "labs": ("The hand by other laboratories' habits", labs),
     "cut": ("What tells that the hand's PSF was cut", cut),
+    "cut-drawn": ("Drawn pictures through PSFs that were cut", cut_drawn),
     "coarse": ("Pairs in coarse pixels", coarse_pairs),
     "dark": ("Pairs whose dark level is wrong", dark_levels),
     "speed": ("Time against accuracy", speed),

@@ -43,9 +43,9 @@ FIRST_ITERATIONS = "not reliable: the iterations were ended when the picture had
 STILL_CHANGING = "doubtful: the iterations were ended while the picture still changed; similar ones are good"
 UNEXPLAINED = "doubtful: the model leaves {residual} unexplained, whatever similar cases say"
 CUT_PSF = (
-    "doubtful: the PSF goes on beyond the sensor's edges, and what was found lies so far from the middle "
-    "that up to {share:.0%} of its light comes from there, which the PSF does not hold. If the files were "
-    "cropped, give them whole; else a smaller scene in the middle would help, or a smaller pattern (a "
+    "doubtful: the PSF seems to go on beyond the sensor's edges, and what was found lies so far from the "
+    "middle that up to {share:.0%} of its light comes from there, which the PSF does not hold. If the files "
+    "were cropped, give them whole; else a smaller scene in the middle would help, or a smaller pattern (a "
     "farther scene, a diffuser nearer to the sensor)"
 )
 NO_CASES = "not judged: there are no known cases of {method}"

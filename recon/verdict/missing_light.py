@@ -2,12 +2,13 @@
 
 A point beside the middle casts the pattern moved, and moves onto the sensor what lay beyond its edge when
 the PSF was taken. No calibration holds that light. A pattern is taken to be as bright beyond an edge as along
-it, for want of knowledge; so each point found lacks a strip as wide as the point is off the middle. That is
-the most that may lack: a pattern may end behind the edge.
+it, above the PSF's darkest places, for want of knowledge; so each point found lacks a strip as wide as the
+point is off the middle. That is the most that may lack: a pattern may end behind the edge.
 """
 
 from __future__ import annotations
 
+import math
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -18,6 +19,13 @@ Floats = npt.NDArray[np.float64]
 
 EDGE = 0.04
 """Width of a PSF's edges, whose mean is what lies beyond them, relative to the shorter side."""
+DARK = 0.05
+"""Share of a PSF's places that are its darkest: as much light lies along edges without any pattern there."""
+MOST_DARK, BRIGHTEST = 0.03, 0.999
+"""Of the brightest thousandth at most so much is taken for a pedestal: of a pattern that fills its frame the
+darkest places are as bright as the rest, and a larger pedestal leaves no good picture."""
+ABOVE = 3.0
+"""Standard errors of its mean by which an edge has to be brighter than that: less may be noise."""
 MUCH, MUCH_INSIDE = 0.28, 0.09
 """Light that lacks, relative to what the PSF casts on the sensor, of all that was found and of what was found
 opposite to the sensor, from both of which a picture is doubtful. The second spares small scenes: with too
@@ -53,8 +61,7 @@ def missing_light(psfs: Array, found: Array, window: tuple[slice, slice], axis: 
         Row and column of it where a point casts the PSF as it is.
     """
     each = [
-        _missing(np.maximum(psfs[min(c, len(psfs) - 1)], 0), np.maximum(one, 0), window, axis)
-        for c, one in enumerate(found)
+        _missing(psfs[min(c, len(psfs) - 1)], np.maximum(one, 0), window, axis) for c, one in enumerate(found)
     ]
     return max(each, key=lambda one: (one.much, one.of_all))
 
@@ -76,11 +83,31 @@ def _missing(psf: Array, found: Array, window: tuple[slice, slice], axis: tuple[
 
 
 def _edges(psf: Array) -> tuple[float, float, float, float]:
-    """Return a PSF's mean light along its top, bottom, left and right."""
+    """Return a PSF's mean light along its top, bottom, left and right, above that of its darkest places."""
     wide = max(1, round(EDGE * min(psf.shape)))
     strips = psf[:wide], psf[-wide:], psf[:, :wide], psf[:, -wide:]
-    top, bottom, left, right = (float(strip.mean(dtype=np.float64)) for strip in strips)
+    most = MOST_DARK * float(np.quantile(psf, BRIGHTEST))
+    dark = min(max(_darkest(psf, wide), 0.0), most)
+    top, bottom, left, right = (_above(strip, dark) for strip in strips)
     return top, bottom, left, right
+
+
+def _above(strip: Array, dark: float) -> float:
+    light = float(strip.mean(dtype=np.float64)) - dark
+    error = float(strip.std(dtype=np.float64)) / math.sqrt(strip.size)
+    return light if light > ABOVE * error else 0.0
+
+
+def _darkest(psf: Array, wide: int) -> float:
+    """Return the mean light of a PSF's darkest places, found in every other row and read in those between.
+
+    Noise that makes a place look dark in some rows is not in the others.
+    """
+    side = max(2, wide // 2 * 2)
+    height, width = (n // side for n in psf.shape)
+    places = psf[: height * side, : width * side].reshape(height, side, width, side)
+    seen, read = (places[:, start::2].mean(axis=(1, 3), dtype=np.float64) for start in (0, 1))
+    return float(read[seen <= np.quantile(seen, DARK)].mean()) if seen.size else 0.0
 
 
 def _cast(psf: Array, down: Array, across: Array) -> Floats:
