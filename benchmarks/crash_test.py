@@ -78,6 +78,8 @@ class Attempt:
     """What one process did: its promised frames with their checksums, how it ended, how long it lived."""
 
     promised: dict[int, int]
+    sent: bool
+    """Whether it got its signal."""
     killed: bool
     code: int
     said: str
@@ -162,7 +164,7 @@ class Work:
         lived_s = time.monotonic() - (since_s or began_s)
         code = os.waitstatus_to_exitcode(status)
         killed = sent and code in (-number, 128 + number)  # any other end is a failure
-        return Attempt(promised, killed, code, said, lived_s)
+        return Attempt(promised, sent, killed, code, said, lived_s)
 
     def _begun(self, folder: Path, promised: dict[int, int], before: set[Path]) -> bool:
         if self.kind.begins == "finishing":
@@ -185,6 +187,8 @@ class Work:
             done = self.attempt(folder, in_folder(command, folder), when, self._number)
             attempts += 1
             promised |= done.promised
+            if done.sent and self._number == signal.SIGSTOP:
+                tally.kills += 1  # it goes on by itself
             if done.killed:
                 tally.kills += 1
                 if self.kind.makes_run:

@@ -124,6 +124,7 @@ def work(folder: Path, command: Sequence[str], promises: int, *, clock_jumps: bo
         for handle, name in ((1, "out"), (2, "said")):
             os.dup2(os.open(name, os.O_WRONLY | os.O_CREAT | os.O_TRUNC), handle)
         faulthandler.enable()
+        signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's background job ignores it
         (folder / "tmp").mkdir(exist_ok=True)
         tempfile.tempdir = os.environ["TMPDIR"] = str(folder / "tmp")
         promising(promises)
