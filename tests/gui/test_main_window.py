@@ -9,8 +9,7 @@ from pathlib import Path
 
 import pytest
 from PySide6.QtCore import QSettings, Qt
-from PySide6.QtGui import QColor
-from PySide6.QtWidgets import QApplication, QLabel, QMessageBox, QPushButton, QWidget
+from PySide6.QtWidgets import QApplication, QMessageBox
 from pytestqt.qtbot import QtBot
 
 from benchmarks.gui_stalls import opened
@@ -19,13 +18,10 @@ from gui.jobs import JobContext, JobState
 from gui.main_window import MainWindow
 from gui.panels import PANELS, PanelEntry
 from gui.panels.live import LivePanel
-from gui.panels.tasks import TasksPanel
 from gui.procedure_panel import ProcedurePanel
 from gui.session import BenchSession
-from gui.theme import RED, THEMES
 from gui.widgets.building import every
-from gui.widgets.dialogues import Question, TextWindow, choose_path
-from gui.widgets.tab_order import stops_of
+from gui.widgets.dialogues import TextWindow, choose_path
 from instrument.bench.bench import Bench
 from instrument.bench.lit import LightState
 from instrument.files.errors import BenchError
@@ -252,67 +248,6 @@ def test_the_log_filters_by_level_and_words(window: MainWindow) -> None:
     assert "a detail" not in view.toPlainText()
 
 
-def test_no_part_that_takes_a_theme_at_once_has_hundreds_of_widgets(
-    qtbot: QtBot, window: MainWindow, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    files = window.panel("tasks")
-    assert isinstance(files, TasksPanel)
-    window.panel("holograms")
-    reconstructions = window.panel("reconstructions")
-    for name in ("video", "patterned"):  # as in a day's work
-        files.choose(name)
-        qtbot.waitUntil(lambda name=name: name in files._pages, timeout=WAIT_MS)
-    sizes: list[int] = []
-    monkeypatch.setattr("gui.theme.dress", lambda part: sizes.append(len(part.findChildren(QWidget))))
-    window.set_theme("light")
-    qtbot.waitUntil(lambda: not window.is_restyling, timeout=WAIT_MS)
-    monkeypatch.undo()
-    assert len(files.findChildren(QWidget)) > 400
-    assert len(reconstructions.findChildren(QWidget)) > 300
-    assert max(sizes) < 250
-    window.set_theme("red")
-    qtbot.waitUntil(lambda: not window.is_restyling, timeout=WAIT_MS)
-    files.choose("activity")  # made under another theme than those beside it
-    qtbot.waitUntil(lambda: "activity" in files._pages, timeout=WAIT_MS)
-    for name in ("video", "activity"):
-        words = next(each for each in files._pages[name].form.findChildren(QLabel) if each.text())
-        assert words.palette().windowText().color().name() in (RED.text, RED.dim), name
-    window.set_theme("dark")
-    qtbot.waitUntil(lambda: not window.is_restyling, timeout=WAIT_MS)
-
-
-@pytest.mark.parametrize("name", sorted(THEMES))
-def test_a_theme_can_be_chosen_and_another_before_it_is_there(
-    qtbot: QtBot, window: MainWindow, settings: QSettings, name: str
-) -> None:
-    window.panel("reconstructions")
-    for chosen in ("light", name):
-        window.set_theme(chosen)
-    qtbot.waitUntil(lambda: not window.is_restyling, timeout=WAIT_MS)
-    assert window.updatesEnabled()
-    assert settings.value("theme") == name
-    late = window.panel("films")  # made under the theme that is not the program's first
-    question = Question(window, "Title", "Text", ("Yes", "No"), lambda _: None)
-    assert window.statusBar().palette().window().color() == QColor(THEMES[name].panel)
-    for part in (window, window.tabs, late, question):
-        assert part.palette().window().color() == QColor(THEMES[name].window)
-    assert late.copy_button.palette().buttonText().color() == QColor(THEMES[name].text)  # by the sheet
-    question.close()
-    window.set_theme("dark")
-
-
-def test_the_red_theme_emits_no_green_or_blue_to_speak_of() -> None:
-    theme = THEMES["red"]
-    for field in theme.__slots__:
-        value = getattr(theme, field)
-        if isinstance(value, bool):
-            continue
-        for colour in (value,) if isinstance(value, str) else value:
-            if colour.startswith("#"):
-                red, green, blue = (int(colour[i : i + 2], 16) for i in (1, 3, 5))
-                assert max(green, blue) <= 0.55 * red, (field, colour)
-
-
 def test_stop_withdraws_what_the_operator_is_asked(qtbot: QtBot, window: MainWindow) -> None:
     session = window.session
     job = session.exclusive_job("By hand", lambda _: session._ask("Please light the scene."))
@@ -480,76 +415,3 @@ def test_the_benchmark_of_stalls_tells_of_a_panel_that_is_not_made(
     monkeypatch.setattr(PanelEntry, "load", lambda _: threading.Event().wait(1.0))
     with pytest.raises(TimeoutError, match=r"Holograms does not stand.*the job that imports it.*Opening"):
         opened(window, "holograms", 0.2)
-
-
-def test_what_is_typed_while_a_button_works_goes_into_no_field(qtbot: QtBot, window: MainWindow) -> None:
-    """After *Auto* the keyboard was in *Gain*, its number selected."""
-    window.activateWindow()
-    qtbot.waitUntil(window.isActiveWindow, timeout=WAIT_MS)
-    live = window.show_panel("live")
-    auto = next(b for b in live.findChildren(QPushButton) if b.text() == "Auto")
-    qtbot.waitUntil(auto.isEnabled, timeout=WAIT_MS)
-    auto.setFocus()
-    auto.setEnabled(False)
-    assert QApplication.focusWidget() is None
-    auto.setEnabled(True)
-    assert auto.hasFocus(), "it has done its work"
-    auto.setEnabled(False)
-    window.stop_button.setFocus()
-    auto.setEnabled(True)
-    assert window.stop_button.hasFocus(), "the operator went on meanwhile"
-
-
-def test_the_keyboard_of_a_part_that_is_hidden_waits_and_goes_on_from_there(
-    qtbot: QtBot, window: MainWindow
-) -> None:
-    window.activateWindow()
-    qtbot.waitUntil(window.isActiveWindow, timeout=WAIT_MS)
-    live = window.show_panel("live")
-    auto = next(b for b in live.findChildren(QPushButton) if b.text() == "Auto")
-    qtbot.waitUntil(auto.isEnabled, timeout=WAIT_MS)
-    stops = list(stops_of(window))
-    before, after = (stops[stops.index(auto) + step] for step in (-1, 1))
-    auto.setFocus()
-    auto.hide()
-    assert QApplication.focusWidget() is None, "what is typed goes to no field"
-    auto.show()
-    assert auto.hasFocus()
-    for key, beside in ((Qt.Key.Key_Tab, after), (Qt.Key.Key_Backtab, before)):
-        auto.setFocus()
-        auto.hide()
-        qtbot.keyClick(window, key)
-        assert beside.hasFocus()
-        auto.show()
-        assert beside.hasFocus(), "the operator went on meanwhile"
-
-
-def test_the_keyboard_comes_back_into_a_form_that_was_off_as_a_whole(
-    qtbot: QtBot, window: MainWindow
-) -> None:
-    window.activateWindow()
-    qtbot.waitUntil(window.isActiveWindow, timeout=WAIT_MS)
-    live = window.show_panel("live")
-    auto = next(b for b in live.findChildren(QPushButton) if b.text() == "Auto")
-    qtbot.waitUntil(auto.isEnabled, timeout=WAIT_MS)
-    auto.setFocus()
-    live.setEnabled(False)
-    assert QApplication.focusWidget() is None
-    live.setEnabled(True)
-    assert auto.hasFocus()
-
-
-def test_a_part_that_comes_on_first_takes_the_keyboard_from_no_other(
-    qtbot: QtBot, window: MainWindow
-) -> None:
-    window.activateWindow()
-    qtbot.waitUntil(window.isActiveWindow, timeout=WAIT_MS)
-    live = window.show_panel("live")
-    parts = [b for b in live.findChildren(QPushButton) if b.isVisible() and b.isEnabled()][:2]
-    for part in parts:
-        part.setFocus()
-        part.setEnabled(False)
-    assert QApplication.focusWidget() is None
-    for part in parts:
-        part.setEnabled(True)
-    assert parts[1].hasFocus(), "it had the keyboard last"

@@ -126,3 +126,15 @@ def test_a_line_of_the_log_keeps_what_its_colour_says(qtbot: QtBot, window: Main
     qtbot.waitUntil(lambda: not window.is_restyling, timeout=WAIT_MS)
     assert colour("a line of before") == QColor(DARK.text)
     assert {view.colour_map for view in window.findChildren(ImageView)} == {"grey"}
+
+
+def test_the_red_theme_emits_no_green_or_blue_to_speak_of() -> None:
+    theme = RED
+    for field in theme.__slots__:
+        value = getattr(theme, field)
+        if isinstance(value, bool):
+            continue
+        for colour in (value,) if isinstance(value, str) else value:
+            if colour.startswith("#"):
+                red, green, blue = (int(colour[i : i + 2], 16) for i in (1, 3, 5))
+                assert max(green, blue) <= 0.55 * red, (field, colour)

@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
-from PySide6.QtCore import QEvent, QObject
-from PySide6.QtWidgets import QWidget
+import pytest
+from PySide6.QtCore import QEvent, QObject, QSettings
+from PySide6.QtGui import QColor
+from PySide6.QtWidgets import QLabel, QWidget
 from pytestqt.qtbot import QtBot
 
 from gui.main_window import MainWindow
-from gui.theme import change_theme, sheet
+from gui.panels.tasks import TasksPanel
+from gui.theme import RED, THEMES, change_theme, sheet
+from gui.widgets.dialogues import Question
 from tests.gui.conftest import WAIT_MS
 
 MOST = 150
@@ -63,3 +67,52 @@ def test_no_part_is_large(qtbot: QtBot, window: MainWindow) -> None:
         assert not large, name
     window.set_theme("dark")
     qtbot.waitUntil(lambda: not window.is_restyling, timeout=WAIT_MS)
+
+
+def test_no_part_that_takes_a_theme_at_once_has_hundreds_of_widgets(
+    qtbot: QtBot, window: MainWindow, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    files = window.panel("tasks")
+    assert isinstance(files, TasksPanel)
+    window.panel("holograms")
+    reconstructions = window.panel("reconstructions")
+    for name in ("video", "patterned"):  # as in a day's work
+        files.choose(name)
+        qtbot.waitUntil(lambda name=name: name in files._pages, timeout=WAIT_MS)
+    sizes: list[int] = []
+    monkeypatch.setattr("gui.theme.dress", lambda part: sizes.append(len(part.findChildren(QWidget))))
+    window.set_theme("light")
+    qtbot.waitUntil(lambda: not window.is_restyling, timeout=WAIT_MS)
+    monkeypatch.undo()
+    assert len(files.findChildren(QWidget)) > 400
+    assert len(reconstructions.findChildren(QWidget)) > 300
+    assert max(sizes) < 250
+    window.set_theme("red")
+    qtbot.waitUntil(lambda: not window.is_restyling, timeout=WAIT_MS)
+    files.choose("activity")  # made under another theme than those beside it
+    qtbot.waitUntil(lambda: "activity" in files._pages, timeout=WAIT_MS)
+    for name in ("video", "activity"):
+        words = next(each for each in files._pages[name].form.findChildren(QLabel) if each.text())
+        assert words.palette().windowText().color().name() in (RED.text, RED.dim), name
+    window.set_theme("dark")
+    qtbot.waitUntil(lambda: not window.is_restyling, timeout=WAIT_MS)
+
+
+@pytest.mark.parametrize("name", sorted(THEMES))
+def test_a_theme_can_be_chosen_and_another_before_it_is_there(
+    qtbot: QtBot, window: MainWindow, settings: QSettings, name: str
+) -> None:
+    window.panel("reconstructions")
+    for chosen in ("light", name):
+        window.set_theme(chosen)
+    qtbot.waitUntil(lambda: not window.is_restyling, timeout=WAIT_MS)
+    assert window.updatesEnabled()
+    assert settings.value("theme") == name
+    late = window.panel("films")  # made under the theme that is not the program's first
+    question = Question(window, "Title", "Text", ("Yes", "No"), lambda _: None)
+    assert window.statusBar().palette().window().color() == QColor(THEMES[name].panel)
+    for part in (window, window.tabs, late, question):
+        assert part.palette().window().color() == QColor(THEMES[name].window)
+    assert late.copy_button.palette().buttonText().color() == QColor(THEMES[name].text)  # by the sheet
+    question.close()
+    window.set_theme("dark")
