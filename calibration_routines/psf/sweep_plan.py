@@ -14,6 +14,7 @@ from calibration_routines.psf.sampling import Position
 from calibration_routines.psf.sweep_options import AxialSweep, PointSweep
 from calibration_routines.purpose import Purpose
 from instrument.bench.bench import Bench
+from instrument.files.calibration_file import IN_SWEEP
 from instrument.files.errors import SettingsError, count, duration
 from instrument.files.record import RecordFormat, plain
 from instrument.plan import OFF, SOURCE, Part, Plan, SourcePoints, check, estimate
@@ -302,7 +303,7 @@ def _with_points(old: dict[str, Any]) -> dict[str, Any]:
 SWEEP = Purpose(
     SweepRecord,
     "sweep.json",
-    "calibration",
+    IN_SWEEP,
     RecordFormat(
         "diffuserbench sweep",
         "sweep",

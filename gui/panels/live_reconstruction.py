@@ -28,7 +28,7 @@ from gui.widgets.dialogues import elided, path_field
 from gui.widgets.entry import NumberEdit
 from gui.widgets.image_view import ImageView
 from gui.widgets.orientation import OrientationButton, follow_orientation
-from instrument.files.calibration_file import find_calibration, load_calibration
+from instrument.files.calibration_file import calibration_name, find_calibration, load_calibration
 from instrument.files.errors import BenchError, count, duration
 from instrument.live.light_log import NOTHING_LIT
 from instrument.live.live import LiveResult
@@ -386,7 +386,7 @@ class LiveReconstructionPanel(Panel):
 
     def _caption(self, frame: FrameMetadata) -> str:
         """Say of which frame a picture is, and with which calibration it was made."""
-        made = "" if self.loaded is None else f", calibration: {self.loaded.path.parent.name}"
+        made = "" if self.loaded is None else f", calibration: {calibration_name(self.loaded.path)}"
         return self.session.describe_frame(frame) + made
 
     def _log_new(self, warnings: tuple[str, ...]) -> None:

@@ -12,7 +12,6 @@ import numpy.typing as npt
 from PySide6.QtCore import Qt
 from PySide6.QtWidgets import QStackedWidget, QTabWidget, QWidget
 
-from calibration_routines.psf.sweep_plan import SWEEP
 from gui.background import NewestOnly
 from gui.forms.options_form import OptionsForm, SuggestedName
 from gui.forms.reconstruct import (
@@ -35,7 +34,12 @@ from gui.theme import as_shown
 from gui.widgets.building import Hint, button, fill, in_row, label, split
 from gui.widgets.result_views import ConvergenceView, FactsView, PictureView
 from gui.widgets.volume_view import VolumeView
-from instrument.files.calibration_file import calibrated_depths_um, find_calibration, newest_calibration
+from instrument.files.calibration_file import (
+    calibrated_depths_um,
+    calibration_name,
+    find_calibration,
+    newest_calibration,
+)
 from instrument.files.errors import BenchError, FileError
 from instrument.reconstruction.request import VolumeRequest
 from instrument.reconstruction.stored_result import StoredResult, open_result
@@ -435,7 +439,7 @@ class ReconstructionsPanel(Panel):
         """Begin with the newest calibration where none was named."""
         if newest is not None and not self.form.text(self.form.source):
             self.form.options.set_values({self.form.source: newest})
-            name = newest.parent.name if newest.name == SWEEP.result else newest.name
+            name = calibration_name(newest)
             self.form.note.setText(f"Calibration: {name}, the newest of this bench, for none was chosen.")
 
     def _look_at_depths(self) -> None:

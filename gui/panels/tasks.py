@@ -11,7 +11,6 @@ from typing import Any, NamedTuple, get_args
 from PySide6.QtCore import Qt
 from PySide6.QtWidgets import QLineEdit, QWidget
 
-from calibration_routines.psf.sweep_plan import SWEEP
 from gui.background import NewestOnly
 from gui.forms.fields import Behaviour
 from gui.forms.form_stack import FormStack
@@ -33,7 +32,7 @@ from gui.widgets.building import (
 from gui.widgets.orientation import orientation_of
 from gui.widgets.tab_order import tab_in_order
 from gui.words import in_the_window, level_of, with_signs
-from instrument.files.calibration_file import newest_calibration
+from instrument.files.calibration_file import calibration_name, newest_calibration
 from instrument.files.orientation import Kind
 from instrument.tasks import CHARTS, TASKS, VIDEOS
 from instrument.tasks.task import WRITTEN, Desk, Done, Task
@@ -238,7 +237,7 @@ class TasksPanel(Panel):
             return
         form.set_values({_CALIBRATION: newest})
         if name == self.name and not self.run.is_running:
-            called = newest.parent.name if newest.name == SWEEP.result else newest.name
+            called = calibration_name(newest)
             self.run_bar.words.setText(
                 f"Calibration: {called}, the newest of this bench, for none was chosen."
             )

@@ -40,6 +40,8 @@ _JSON = "calibration.json"
 _PSFS = "psfs.ome.zarr"
 _BACKGROUND = "background.ome.zarr"
 CALIBRATION_FILES = (_JSON, _PSFS, _BACKGROUND)
+IN_SWEEP = "calibration"
+"""A sweep's folder for the calibration that it was taken for."""
 _RESTORE = "Take the calibration again or restore it from a copy."
 _PLAIN_PSFS = (
     "PSF images by themselves tell no places: reconstruct takes one by --psf FILE, one a depth by "
@@ -173,6 +175,11 @@ def find_calibration(folder: Path) -> Path:
         remedy = _CUT_SWEEP.format(folder) if is_run else _PLAIN_PSFS if plain else ""
         raise FileError(folder, f"holds {found}; exactly one is expected.", remedy)
     return inside[0]
+
+
+def calibration_name(folder: Path) -> str:
+    """Return what a calibration is called: as its folder, or as the sweep whose folder that is in."""
+    return folder.parent.name if folder.name == IN_SWEEP else folder.name
 
 
 def calibrated_depths_um(folder: Path | str) -> tuple[float, ...]:

@@ -15,6 +15,7 @@ import zarr
 from instrument.files import atomic, calibration_file
 from instrument.files.calibration_file import (
     CalibrationFileError,
+    calibration_name,
     check_calibration,
     is_calibration,
     load_calibration,
@@ -224,3 +225,8 @@ def test_a_folder_without_permission_is_named(tmp_path: Path, monkeypatch: pytes
     monkeypatch.setattr(Path, "mkdir", refuse)
     with pytest.raises(CalibrationFileError, match="cannot be written: Permission denied"):
         save_calibration(make(), tmp_path / "c")
+
+
+def test_a_calibration_is_called_by_its_own_folder_or_the_sweep_that_took_it() -> None:
+    assert calibration_name(Path("runs/axial/calibration")) == "axial"
+    assert calibration_name(Path("own/mine")) == "mine"
