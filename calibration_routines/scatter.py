@@ -45,9 +45,9 @@ _SHAKEN_PX = 0.05  # frames that scatter less are averaged as they are
 _SURE = 3.0  # standard deviations of its own uncertainty, beyond which a scatter is the bench's
 _STEADY_LIGHT = "give the lamp a steady supply, lengthen the exposure over its flicker"
 _STILL = "clamp source, stage and camera, wait after moves, take the table off what vibrates"
-_SHARP_PX = 2.0
-"""Width of a pattern's finest structure: blurred by ``s`` pixels it changes by about ``(s / this)^2``,
-moved by ``s`` by about ``s / this``."""
+_SHARP_PX, _SHARPEST_PX = 2.0, 0.5
+"""Width of a pattern's finest structure, where it is not seen to be finer, and the finest that pixels hold:
+blurred by ``s`` pixels it changes by about ``(s / this)^2``, moved by ``s`` by about ``s / this``."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -219,6 +219,8 @@ class Scatter:
     """Standard deviation of light that came in evenly, in units of the mean light."""
     averages: int = 1
     """Averages whose frames were looked at."""
+    sharp_px: float = _SHARP_PX
+    """Width of the finest structure of what shook, pixels of the camera, as far as it is finer than usual."""
 
     @property
     def brightness_error(self) -> float:
@@ -233,7 +235,16 @@ class Scatter:
     @property
     def blur(self) -> float:
         """About how much a plain average of many differs from one of steady frames, relative."""
-        return (self.motion_px / _SHARP_PX) ** 2 / 2
+        return self.moved**2 / 2
+
+    @property
+    def moved(self) -> float:
+        """About how much single frames differ by their place, relative."""
+        return self.motion_px / min(self.sharp_px, _SHARP_PX)
+
+    def on_pixels(self, factor: int) -> Scatter:
+        """Return it in pixels of the camera, where it was found on pixels ``factor`` times as large."""
+        return replace(self, motion_px=factor * self.motion_px, sharp_px=factor * self.sharp_px)
 
     @property
     def frames_needed(self) -> int:
@@ -269,9 +280,7 @@ class Scatter:
         changes = {
             f"the light flickers by {self.flicker:.1%} from {what} to {what}: {_STEADY_LIGHT}.": self.flicker,
             self._other_light(what): self.ambient,
-            f"the picture shakes by {self.motion_px:.2f} pixels from {what} to {what}: {_STILL}.": (
-                self.motion_px / _SHARP_PX
-            ),
+            f"the picture shakes by {self.motion_px:.2f} pixels from {what} to {what}: {_STILL}.": self.moved,
         }
         most = max(changes.values())
         return tuple(words for words, change in changes.items() if change > 0 and change >= most / 2)
@@ -311,7 +320,22 @@ def scatter_of(frames: Float) -> tuple[Scatter, list[Change]]:
     flicker = _beyond(levels.var(ddof=1), [c.brightness_noise for c in changes]) / abs(levels.mean())
     motion = _beyond(places.var(axis=0, ddof=1).sum(), [c.place_noise for c in changes])
     came = _beyond(ambient.var(ddof=1), [c.brightness_noise for c in changes])
-    return Scatter(len(frames), float(flicker), motion, came), changes
+    sharp_px = _finest_px(frames) if motion else _SHARP_PX
+    return Scatter(len(frames), float(flicker), motion, came, sharp_px=sharp_px), changes
+
+
+def _finest_px(frames: Float) -> float:
+    """Return the width of the finest structure that frames share: the ratio of their light to its slopes.
+
+    One half of the frames against the other: what noise adds to slopes is not in both.
+    """
+    one, other = (frames[start::2].mean(axis=0, dtype=np.float32) for start in (0, 1))
+    one, other = one - np.median(one), other - np.median(other)
+    slopes = sum(float(np.vdot(np.diff(one, axis=axis), np.diff(other, axis=axis))) for axis in (0, 1))
+    light = float(np.vdot(one, other))
+    if not (light > 0 and slopes > 0):
+        return _SHARP_PX
+    return float(np.clip(np.sqrt(light / slopes), _SHARPEST_PX, _SHARP_PX))
 
 
 def _against(frames: Float, reference: Float) -> list[Change]:
@@ -380,4 +404,5 @@ def pooled(scatters: Sequence[Scatter]) -> Scatter:
         name: float(np.sqrt(np.mean([getattr(one, name) ** 2 for one in known])))
         for name in ("flicker", "motion_px", "ambient")
     }
-    return Scatter(min(one.frames for one in known), averages=len(known), **means)
+    sharp_px = min(one.sharp_px for one in known)
+    return Scatter(min(one.frames for one in known), averages=len(known), sharp_px=sharp_px, **means)

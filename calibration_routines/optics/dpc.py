@@ -281,7 +281,7 @@ def _steady(run: Run, label: str, dark: DarkModel) -> tuple[Image, Scatter]:
     """
     steady = light_of(run, [step.index for step in run.steps(label)], dark)
     scatter, _ = scatter_of(block_mean(steady.frames, _COARSE))
-    return steady.mean, replace(scatter, motion_px=_COARSE * scatter.motion_px)
+    return steady.mean, scatter.on_pixels(_COARSE)
 
 
 def _unlike(frames: int) -> tuple[str, ...]:

@@ -173,9 +173,8 @@ class _Frames:
         for frames in self.of[PICTURE].values():
             seen = np.stack([self.mean([n]).mean(axis=0) for n in frames])
             scatters.append(scatter_of(seen)[0])
-        shaken = pooled(scatters)
         by = self._record.asked.binning
-        shaken = replace(shaken, flicker=0.0, motion_px=by * shaken.motion_px)
+        shaken = replace(pooled(scatters).on_pixels(by), flicker=0.0)
         words = shaken.findings("picture", put_back=False)
         if not words and shaken.place_error_px > PLACE_PX:
             words = shaken.causes("frame")

@@ -49,6 +49,22 @@ def test_each_fault_is_named_alone_with_its_size(faults: dict[str, float], named
     assert found.motion_px == pytest.approx(2**0.5 * faults.get("motion_px", 0.0), rel=0.5, abs=0.03)
 
 
+@pytest.mark.parametrize(("width_px", "named"), [(0.8, True), (1.0, True), (2.0, False), (4.0, False)])
+def test_shaking_is_named_by_how_fine_the_structure_is_that_it_blurs(width_px: float, named: bool) -> None:
+    rng = np.random.default_rng(8)
+    beads = np.zeros((120, 140))
+    beads[tuple(rng.integers(12, 108, (2, 60)))] = rng.uniform(0.3, 1.0, 60)
+    light = ndimage.gaussian_filter(beads, width_px)
+    light *= 2000 / light.max()
+    taken = [ndimage.shift(light, rng.normal(0, 0.2, 2)) for _ in range(6)]
+    seen = np.array([rng.normal(one, np.sqrt(0.2 * np.maximum(one, 0) + 2)) for one in taken], np.float32)
+    found = scatter_of(seen)[0]
+    assert found.motion_px == pytest.approx(0.28, rel=0.5)
+    assert found.sharp_px == pytest.approx(min(width_px, 2.0), rel=0.2)
+    assert bool(found.findings()) == named
+    assert found.on_pixels(2).moved >= found.moved  # finer than usual is what is finer on the camera's pixels
+
+
 def test_shaken_frames_are_put_onto_one_another_and_flickering_ones_made_alike() -> None:
     steady = steadied(frames(flicker=0.1, motion_px=0.8, n=6))
     plain = frames(motion_px=0.8, n=6).mean(axis=0)
