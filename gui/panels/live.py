@@ -152,9 +152,9 @@ class LivePanel(Panel):
         first = (self.live_button, self.snap_button, self.average, self.reconstruct_button)
         fill(row, *first, 10, light, None, across=True, spacing=6)
         self.only_with(("camera",), self.live_button, self.snap_button)
-        for switch in self.light_buttons.buttons():
-            if switch.property("light") != LightState.DARK:  # which darkens what it can
-                self.only_with(("led_array",), switch)
+        for lit in self.light_buttons.buttons():
+            if lit.property("light") != LightState.DARK:  # which darkens what it can
+                self.only_with(("led_array",), lit)
 
     # Panel ---------------------------------------------------------------------------------------
     def as_python(self) -> str:

@@ -148,10 +148,11 @@ class ProfileLine(_Overlay):
     def follow(self, moved: Moved) -> None:
         """Move its ends with the sensor's pixels; where one would be out of the image it begins anew."""
         places = [moved(end.x(), end.y()) for end in self._places()]
-        if None in places:
+        there = [place for place in places if place is not None]
+        if len(there) < len(places):
             self.begin_anew()
             return
-        for handle, place in zip(self.item.handles, places, strict=True):
+        for handle, place in zip(self.item.handles, there, strict=True):
             self.item.movePoint(handle["item"], pg.Point(*place))
 
     @property
@@ -345,11 +346,11 @@ class LivePicture(QWidget):
         self.frame, self.is_coarse = frame, False
         if (before := self._measured) is not None and before is not frame and _other_light(before, frame):
             self._measure(frame)
-        before, (top, left) = self.view.naming, frame.metadata.roi[:2]
+        naming, (top, left) = self.view.naming, frame.metadata.roi[:2]
         self.view.naming = (left, top, frame.metadata.binning)
         self.view.show_image(frame.image, *self.levels, frame.full_scale)
-        if self.view.naming != before or frame.image.shape[:2] != self._shape:
-            self._follow(before, frame)
+        if self.view.naming != naming or frame.image.shape[:2] != self._shape:
+            self._follow(naming, frame)
             self._shape = frame.image.shape[:2]
 
     def show_coarse(self, counts: Counts, factor: int) -> None:
