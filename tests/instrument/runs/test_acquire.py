@@ -23,7 +23,7 @@ def found(
     condition: RunCondition, *, recording: bool, sound: bool = False, todo: tuple[int, ...] = ()
 ) -> Any:
     damaged = [SimpleNamespace(index=3, problem="is gone")]
-    facts = {"condition": condition, "is_recording": recording, "is_sound": sound, "todo": todo}
+    facts = {"condition": condition, "is_recording": recording, "is_as_written": sound, "todo": todo}
     return SimpleNamespace(**facts, damaged=damaged, log_bytes=9, files=())
 
 

@@ -53,7 +53,7 @@ def a_run(**changes: Any) -> Any:
     run = SimpleNamespace(**facts | changes)
     run.without_a_line = lambda: list(run.beside)
     run.missing = lambda: list(run.gone)
-    run.damaged = lambda _, read: run.bad if read else ()
+    run.damaged = lambda _, read, noted: run.bad if read or noted else ()
     return run
 
 
@@ -89,24 +89,31 @@ RECORDING = {"plan": None}
     ],
 )
 def test_what_contradicts_itself_is_said(
-    changes: dict[str, Any], problems: list[str], monkeypatch: pytest.MonkeyPatch
+    changes: dict[str, Any], problems: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(inspection, "file_problems", lambda _: ["a file"])
-    found = verify(a_run(**changes))
+    found = verify(a_run(path=tmp_path, **changes))
     assert len(found.problems) == len(problems)
     assert all(said.startswith(words) for said, words in zip(found.problems, problems, strict=True))
     assert found.files == ("a file",)
 
 
-def test_frames_are_counted_and_those_to_do_are_named(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_frames_are_counted_and_those_to_do_are_named(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(inspection, "file_problems", lambda _: [])
     run = a_run(
-        records={0: record(0), 2: record(2)}, unlisted={8: "", 9: ""}, bad=(DamagedFrame(2, ""),), beside=[5]
+        path=tmp_path,
+        records={0: record(0), 2: record(2)},
+        unlisted={8: "", 9: ""},
+        bad=(DamagedFrame(2, ""),),
+        beside=[5],
     )
+    assert verify(run, read=False).todo == (1,)
     found = verify(run)
     assert (found.frames, found.todo, found.without_a_line) == (3, (1, 2), (5,))
     assert (found.log_bytes, found.is_recording, found.condition) == (7, False, RunCondition.COMPLETED)
-    assert verify(run, read=False).todo == (1,)
+    assert verify(run, read=False).todo == (1, 2), "what was damaged when it was read is noted"
     run.is_being_written, run.plan = True, None
     assert (verify(run).without_a_line, verify(run).todo, verify(run).is_recording) == ((), (), True)
 
