@@ -20,7 +20,6 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-import numpy.typing as npt
 
 from calibration_routines.optics.bead_photographs import BeadSlides, photograph_slides
 from calibration_routines.optics.beads import window_for
@@ -32,12 +31,11 @@ from instrument.bench.config_file import parse_config
 from instrument.files.errors import BenchError
 from instrument.runs.run import Run
 from instrument.runs.run_control import RunControl
+from recon.arrays import Float32Array
 from recon.base.blocks import block_mean
 from recon.blind import calibrate_from_beads
 from recon.errors import InputError
 from recon.types import Geometry
-
-Floats = npt.NDArray[np.float32]
 
 BENCH = """
 [camera]
@@ -62,13 +60,13 @@ OFF = 0.2
 class Slides:
     """Photographs, and what a point at their depth looks like."""
 
-    images: Floats
+    images: Float32Array
     """(n, height, width), unbinned."""
     noise_variance: float
     """Of a pixel of theirs, by how frames scatter."""
     asked: BeadSlides
     geometry: Geometry
-    truth: Floats
+    truth: Float32Array
     """(5, height, width): on the axis, and at four places."""
 
 
@@ -96,7 +94,7 @@ def photographed(world: str, beads: int, asked: BeadSlides) -> Slides:
         )
 
 
-def likeness(found: Floats, truth: Floats, binning: int) -> float:
+def likeness(found: Float32Array, truth: Float32Array, binning: int) -> float:
     """Return how alike a PSF is to the unbinned true one, shifted by unbinned pixels and binned."""
     grid = [2 * n for n in found.shape]
     spectrum = np.fft.rfft2(found, grid)

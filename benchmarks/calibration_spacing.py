@@ -19,14 +19,12 @@ from datetime import UTC, datetime
 from pathlib import Path
 
 import numpy as np
-import numpy.typing as npt
 
 from recon import reconstruct
+from recon.arrays import Float32Array, Float64Array
 from recon.base import metrics
 from recon.optics.fall_off import gaussian_fall_off
 from recon.types import Calibration, Geometry
-
-Image = npt.NDArray[np.float32]
 
 
 @dataclass(frozen=True)
@@ -49,7 +47,7 @@ class Microscope:
         """Sensor micrometres an object micrometre."""
         return self.distance_um / self.z_um
 
-    def photons(self, points: npt.NDArray[np.float64]) -> Image:
+    def photons(self, points: Float64Array) -> Float32Array:
         """Render points ``(x_um, y_um, light)`` spot by spot."""
         rng = np.random.default_rng(self.seed)
         lenses = rng.uniform(-0.5, 0.5, (self.lenslets, 2)) * self.aperture_um
@@ -64,13 +62,13 @@ class Microscope:
         columns = (x / self.pitch_um).ravel() + self.shape[1] // 2
         return _spots(self.shape, rows, columns, light, self.spot_px)
 
-    def photograph(self, points: npt.NDArray[np.float64], gain: float, seed: int) -> Image:
+    def photograph(self, points: Float64Array, gain: float, seed: int) -> Float32Array:
         """Add photon and read noise; ``gain`` electrons for each unit of light."""
         rng = np.random.default_rng([self.seed, seed])
         noisy = rng.poisson(gain * self.photons(points)) + rng.normal(0, self.read_noise, self.shape)
         return noisy.astype(np.float32)
 
-    def gain(self, points: npt.NDArray[np.float64], electrons: float) -> float:
+    def gain(self, points: Float64Array, electrons: float) -> float:
         """Return the gain that gives the brightest pixel so many electrons."""
         return electrons / float(self.photons(points).max())
 
@@ -93,7 +91,7 @@ class Microscope:
             geometry=Geometry(self.pitch_um, self.distance_um / 1e3),
         )
 
-    def truth(self, points: npt.NDArray[np.float64]) -> Image:
+    def truth(self, points: Float64Array) -> Float32Array:
         """Return the scene on the reconstruction's grid, each point a spot as wide as the PSF's."""
         scale = self.magnification / self.pitch_um
         rows = -points[:, 1] * scale + self.shape[0] // 2
@@ -101,7 +99,7 @@ class Microscope:
         return _spots(self.shape, rows, columns, points[:, 2], self.spot_px)
 
 
-def star(half_um: tuple[float, float], step_um: float, spokes: int = 9) -> npt.NDArray[np.float64]:
+def star(half_um: tuple[float, float], step_um: float, spokes: int = 9) -> Float64Array:
     """Points of a spoke target that fills the field, off every grid: (n, 3)."""
     rng = np.random.default_rng(5)
     y, x = np.meshgrid(*(np.arange(-h, h, step_um) for h in half_um), indexing="ij")
@@ -117,7 +115,7 @@ class Result:
     spacing_um: float | None
     points: int
     psnr_db: float
-    image: Image
+    image: Float32Array
     seconds: float
 
 
@@ -128,7 +126,7 @@ def compare(
     *,
     step_um: float,
     iterations: int,
-) -> tuple[Image, Image, list[Result]]:
+) -> tuple[Float32Array, Float32Array, list[Result]]:
     """Return the truth, the measurement, and a reconstruction for each spacing."""
     scene = star((0.92 * half_um[0], 0.92 * half_um[1]), step_um)
     measured = camera.photograph(scene, camera.gain(scene, 20_000.0), 7)
@@ -156,11 +154,11 @@ def compare(
 
 def _spots(
     shape: tuple[int, int],
-    rows: npt.NDArray[np.float64],
-    columns: npt.NDArray[np.float64],
-    light: npt.NDArray[np.float64],
+    rows: Float64Array,
+    columns: Float64Array,
+    light: Float64Array,
     sigma: float,
-) -> Image:
+) -> Float32Array:
     """Sum of Gaussian spots at continuous places, each of unit sum times its light."""
     image = np.zeros((shape[0] + 16, shape[1] + 16))
     row, column = np.floor(rows).astype(int), np.floor(columns).astype(int)
@@ -176,7 +174,7 @@ def _spots(
     return image[8:-8, 8:-8].astype(np.float32)
 
 
-def _blurred(image: Image, sigma: float) -> Image:
+def _blurred(image: Float32Array, sigma: float) -> Float32Array:
     from scipy.ndimage import gaussian_filter
 
     return np.asarray(gaussian_filter(image, sigma), np.float32)
@@ -199,7 +197,7 @@ def main() -> None:
     _draw(truth, measured, results, arguments.out)
 
 
-def _draw(truth: Image, measured: Image, results: list[Result], out: Path) -> None:
+def _draw(truth: Float32Array, measured: Float32Array, results: list[Result], out: Path) -> None:
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 

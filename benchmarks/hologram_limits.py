@@ -21,7 +21,8 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 import numpy as np
 
 from instrument.files.sample_images import load_sample
-from recon.base.metrics import Image, ssim
+from recon.arrays import Array
+from recon.base.metrics import ssim
 from recon.base.threads import set_threads
 from recon.holography import (
     DcTerm,
@@ -52,14 +53,14 @@ def limits(display: Display, name: str, iterations: int) -> list[tuple[str, floa
     ]
 
 
-def flip(shown: Image, wanted: Image) -> float:
+def flip(shown: Array, wanted: Array) -> float:
     """Mean FLIP error (Andersson et al. 2020) of intensities on an sRGB screen; nan without its library."""
     try:
         from flip_evaluator import evaluate
     except ImportError:
         return float("nan")
 
-    def coded(image: Image) -> Image:
+    def coded(image: Array) -> Array:
         image = image.clip(0, 1)
         grey = np.where(image <= 0.0031308, 12.92 * image, 1.055 * image ** (1 / 2.4) - 0.055)
         return np.repeat(grey.astype(np.float32)[..., None], 3, axis=2)

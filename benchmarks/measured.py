@@ -21,7 +21,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
@@ -32,9 +31,9 @@ from benchmarks.measured_speed import speed
 from benchmarks.measured_variants import coarse_pairs, dark_levels, variants
 from benchmarks.uncertainty import measured_pairs_held
 from recon import Calibration, Reconstruction, reconstruct
+from recon.arrays import Array
 from recon.base.threads import get_threads, set_threads
 
-Array = npt.NDArray[Any]
 PRIORS = ("tv", "l1", "nonnegative")
 LAST = 8
 """Of the USAF target's 44 planes, those in which light gathers that fits nowhere."""

@@ -10,7 +10,6 @@ from typing import Any
 
 import cv2
 import numpy as np
-import numpy.typing as npt
 from scipy.fft import irfft2, rfft2
 
 from benchmarks.measured_variants import BINNING, FULL, alike, compressed, counts, light
@@ -19,11 +18,11 @@ from instrument.files.images import ImageFile
 from instrument.reconstruction.job import Job, job_from_files
 from instrument.reconstruction.options import InputOptions
 from recon import reconstruct
+from recon.arrays import Array
 from recon.base.blocks import block_mean
 from recon.errors import InputError
 from recon.evaluation.measured_sets import data_folder, measured_set
 
-Array = npt.NDArray[Any]
 WEIGHTS = (3e-4, 1e-3, 3e-3)
 """Of total variation, of a photograph scaled to 1: the best counts, which a user could not know."""
 ITERATIONS = 150

@@ -4,15 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 from scipy.signal import fftconvolve
 
 from benchmarks.measured_blind import Case, dusty, on_a_slope, rows_of, window
 from benchmarks.measured_variants import BINNING, FULL, alike, columns, compressed, counts, light, middle
 from recon import reconstruct
+from recon.arrays import Array
 from recon.base.blocks import block_mean
 from recon.evaluation import content
 from recon.evaluation.measured_sets import MeasuredSet, measured_set
@@ -22,8 +21,6 @@ from recon.reconstruction.result import window_of
 from recon.reconstruction.selection import choose
 from recon.reconstruction.solve import solve
 from recon.verdict.missing_light import MUCH, MUCH_INSIDE
-
-Array = npt.NDArray[Any]
 
 
 def few_counts(raw: Array, share: float, dark: float = 30) -> Array:

@@ -4,20 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from benchmarks.measured_blind import plain_admm
 from benchmarks.measured_variants import alike
 from recon import Calibration, reconstruct
+from recon.arrays import Array
 from recon.base.blocks import block_mean
 from recon.blind.known_pictures import psf_from_pictures
 from recon.blind.left_out import fare
 from recon.evaluation.measured_sets import MeasuredSet, measured_pairs, measured_set
-
-Array = npt.NDArray[Any]
 
 
 @dataclass(frozen=True)

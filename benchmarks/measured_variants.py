@@ -9,19 +9,18 @@ from typing import Any
 
 import cv2
 import numpy as np
-import numpy.typing as npt
 
 from instrument.files.errors import FileError
 from instrument.files.images import ImageFile
 from instrument.reconstruction.job import job_from_files
 from instrument.reconstruction.options import InputOptions
 from recon import reconstruct
+from recon.arrays import Array
 from recon.base.blocks import block_mean
 from recon.blind.known_pictures import psf_from_pictures
 from recon.blind.left_out import judged_by
 from recon.evaluation.measured_sets import HAND_DARK, data_folder, measured_pairs, measured_set
 
-Array = npt.NDArray[Any]
 BINNING, COARSE = 8, 6
 FULL = 65520
 

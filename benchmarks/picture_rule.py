@@ -24,8 +24,8 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from benchmarks.lenslet_scene import Camera, expose
 from recon import reconstruct
+from recon.arrays import Array
 from recon.base.threads import set_threads
-from recon.camera.base import Array
 from recon.evaluation.chart_judge import score
 from recon.evaluation.scene import make_scene
 

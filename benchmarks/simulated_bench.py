@@ -11,16 +11,15 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-import numpy.typing as npt
 from matplotlib.figure import Figure
 
 from drivers.simulated.options import WorldOptions
 from drivers.simulated.world import SimulatedWorld
+from recon.arrays import Float32Array
 from recon.optics.grid import PixelGrid, mixed_spectrum
 from recon.optics.scene import Scene
 from recon.optics.sensor import Readout, expose
 
-Image = npt.NDArray[np.float32]
 GREEN = (0.0, 1.0, 0.0)
 WHITE = (1.0, 1.0, 1.0)
 ANGLES_DEG = (5, 10, 15, 20, 25, 30)
@@ -31,10 +30,10 @@ def world(preset: str) -> SimulatedWorld:
     return SimulatedWorld(WorldOptions.model_validate({"preset": preset, "time_scale": 0.0}))
 
 
-def timed(name: str, function: object, *arguments: object) -> Image:
+def timed(name: str, function: object, *arguments: object) -> Float32Array:
     """Call and print how long it took."""
     wall, cpu = time.perf_counter(), time.process_time()
-    result: Image = function(*arguments)  # type: ignore[operator]
+    result: Float32Array = function(*arguments)  # type: ignore[operator]
     print(f"{name:48} {time.perf_counter() - wall:7.2f} s wall {time.process_time() - cpu:7.2f} s CPU")
     return result
 
@@ -55,7 +54,7 @@ def similarity_with_angle(bench: SimulatedWorld, z_um: float) -> list[float]:
     return [float(np.fft.irfft2(spectrum * spectra[0].conj(), shape).max()) for spectrum in spectra[1:]]
 
 
-def contrast(image: Image) -> Image:
+def contrast(image: Float32Array) -> Float32Array:
     """Stretch as in Fig. A.2: from 0 to 30 % of the maximum (99.99th percentile)."""
     return np.clip(image / (0.3 * np.quantile(image, 0.9999)), 0, 1)
 

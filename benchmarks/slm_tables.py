@@ -15,14 +15,12 @@ from collections import Counter
 from collections.abc import Callable
 
 import numpy as np
-import numpy.typing as npt
 
 from calibration_routines.display import slm_phases
 from calibration_routines.display.slm_phases import MAX_PHASE_ERROR_RAD, steady_phases
 from calibration_routines.purpose import CalibrationError
+from recon.arrays import Float32Array, Float64Array
 from recon.errors import InputError
-
-Array = npt.NDArray[np.float64]
 
 BEFORE = np.array([-0.5, 7.5, 15.5, 23.5, 31.5, 32.5])
 TRUTH = 7.2 * np.linspace(0, 1, 33) ** 1.4
@@ -30,13 +28,13 @@ ONE_SERIES_RAD = 0.004
 WANTED_RAD = 0.02
 
 
-def flickering(flicker: float, seed: int) -> Callable[[], tuple[Array, npt.NDArray[np.float32]]]:
+def flickering(flicker: float, seed: int) -> Callable[[], tuple[Float64Array, Float32Array]]:
     """Return what takes one series after the other: pictures of the levels, and of level 0 in between."""
     rng = np.random.default_rng(seed)
     one, other = (rng.normal(size=(24, 24)) + 1j * rng.normal(size=(24, 24)) for _ in range(2))
     pictures = np.abs(one + other * np.exp(1j * TRUTH)[:, None, None]) ** 2
 
-    def take() -> tuple[Array, npt.NDArray[np.float32]]:
+    def take() -> tuple[Float64Array, Float32Array]:
         shown, again = (1 + flicker * rng.standard_normal((n, 1, 1)) for n in (len(TRUTH), len(BEFORE)))
         return shown * pictures, (again * pictures[0]).astype(np.float32)
 

@@ -26,11 +26,11 @@ from datetime import UTC, datetime
 from pathlib import Path
 
 import numpy as np
-import numpy.typing as npt
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from recon import Calibration, InputError, Problem
+from recon.arrays import Float32Array
 from recon.base.blocks import block_mean
 from recon.camera.transformed import Transformation, transformed
 from recon.evaluation import content
@@ -61,8 +61,8 @@ POSES = {
     "upside down": Transformation(rotation_deg=180, mirrored=True),
     "another binning": Transformation(scale=0.5),
 }
-Photograph = npt.NDArray[np.float32] | Measurement
-Psfs = npt.NDArray[np.float32] | Calibration
+Photograph = Float32Array | Measurement
+Psfs = Float32Array | Calibration
 Known = tuple[str, Photograph, dict[str, Psfs]]
 """What a photograph shows, itself, and calibrations by what is wrong with them."""
 RIGHT, SWAPPED, SAME, MOVED = "right", "swapped", "the same image", "moved by 12 and -15 pixels"

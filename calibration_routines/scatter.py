@@ -19,11 +19,11 @@ import numpy as np
 import numpy.typing as npt
 from scipy import ndimage
 
+from recon.arrays import Float32Array
 from recon.base.blocks import block_mean
 from recon.camera.registration import moved, register
 
-Float = npt.NDArray[np.float32]
-Floats = npt.NDArray[np.float64]
+Float = Float32Array
 
 TOLERATED = 0.02
 """Part of a result that a fault of the bench may change without being named."""

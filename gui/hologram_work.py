@@ -11,7 +11,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from calibration_routines.display.display_io import DisplayBench, bring_mask
 from calibration_routines.display.hologram_photograph import Photographed, photograph_hologram, write_capture
@@ -39,6 +38,7 @@ from instrument.files.results import free_result
 from instrument.files.slm_image import load_slm_correction
 from instrument.reconstruction.forecast import Forecast
 from instrument.runs.run_control import EndedEarlyError, RunControl
+from recon.arrays import Float32Array
 from recon.base.as_python import Imports, expression
 from recon.base.declare import option
 from recon.holography import Display, HologramOptions, HologramRecord, Target
@@ -126,7 +126,7 @@ class Progress:
 
     share: float
     history: tuple[HologramRecord, ...]
-    phase_rad: npt.NDArray[np.float32]
+    phase_rad: Float32Array
 
 
 @dataclass(frozen=True, slots=True)

@@ -8,8 +8,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy.typing as npt
-
 from calibration_routines.optics.photograph import PHOTOGRAPH
 from calibration_routines.plan_procedures import can_go_on, why_no_result
 from calibration_routines.psf.sweep_plan import SWEEP
@@ -22,6 +20,7 @@ from instrument.files.errors import percent
 from instrument.files.images import read_image
 from instrument.runs.inspection import Verification, verify
 from instrument.runs.run import Run
+from recon.arrays import Array
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,7 +45,7 @@ class Opened:
 class Picture:
     """A frame that was read, with its levels and what is said of it."""
 
-    image: npt.NDArray[Any]
+    image: Array
     low: float
     high: float
     full_scale: int
@@ -85,7 +84,7 @@ def read_frame(opened: Opened, index: int) -> Picture | str:
     return _picture(f"Frame {index} of {run.n_frames}{what}", image, metadata)
 
 
-def _picture(what: str, image: npt.NDArray[Any], metadata: FrameMetadata) -> Picture:
+def _picture(what: str, image: Array, metadata: FrameMetadata) -> Picture:
     low, high = usual_levels(image)
     words = [
         what,

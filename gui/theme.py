@@ -6,7 +6,6 @@ import logging
 from collections.abc import Generator, Iterator, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Any
 from weakref import WeakSet
 
 import numpy as np
@@ -17,6 +16,7 @@ from PySide6.QtWidgets import QApplication, QDialog, QWidget
 from shiboken6 import isValid
 
 from instrument.live.frame_view import SATURATED
+from recon.arrays import Array, Float32Array
 
 
 @dataclass(frozen=True, slots=True)
@@ -462,20 +462,20 @@ def spares_hues(name: str) -> bool:
     return name == "red"
 
 
-def indices_of(image: npt.NDArray[Any], low: float, high: float) -> npt.NDArray[np.float32]:
+def indices_of(image: Array, low: float, high: float) -> Float32Array:
     """Return an image's places in a map, 0 to 254; what is no number is darkest."""
     scaled = (np.asarray(image, np.float32) - np.float32(low)) * np.float32(_SIGNAL / max(high - low, 1e-12))
-    places: npt.NDArray[np.float32] = np.clip(np.nan_to_num(scaled, copy=False), 0, _SIGNAL, out=scaled)
+    places: Float32Array = np.clip(np.nan_to_num(scaled, copy=False), 0, _SIGNAL, out=scaled)
     return places
 
 
-def grey_indices(image: npt.NDArray[Any], low: float, high: float) -> npt.NDArray[np.float32]:
+def grey_indices(image: Array, low: float, high: float) -> Float32Array:
     """Return the same of a coloured image (height, width, 3), by the mean of its channels."""
-    places: npt.NDArray[np.float32] = indices_of(image, low, high).mean(axis=2)
+    places: Float32Array = indices_of(image, low, high).mean(axis=2)
     return places
 
 
-def as_shown(image: npt.NDArray[Any], low: float, high: float, name: str) -> npt.NDArray[np.uint8]:
+def as_shown(image: Array, low: float, high: float, name: str) -> npt.NDArray[np.uint8]:
     """Return the 8-bit colours of an image as a view shows it in a map, (height, width, 3)."""
     if image.ndim == 2 or spares_hues(name):
         places = indices_of(image, low, high) if image.ndim == 2 else grey_indices(image, low, high)

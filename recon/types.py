@@ -19,9 +19,9 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from recon.arrays import Array, Float32Array, Float64Array
 from recon.errors import InputError
 
-FloatArray = npt.NDArray[np.float32] | npt.NDArray[np.float64]
 _DTYPES: Mapping[str, type[np.floating]] = {
     "psfs": np.float32,
     "source_positions_um": np.float64,
@@ -29,7 +29,7 @@ _DTYPES: Mapping[str, type[np.floating]] = {
 }
 
 
-def plain_array(given: npt.ArrayLike) -> npt.NDArray[Any]:
+def plain_array(given: npt.ArrayLike) -> Array:
     """Return an array of anything; NaN where NumPy's masks hide a value: they are not seen elsewhere."""
     if isinstance(given, np.ma.MaskedArray) and np.ma.is_masked(given):
         plain = np.array(given.data, np.result_type(given.dtype, np.float32))
@@ -43,7 +43,7 @@ def numbers_of(dtype: np.dtype[Any]) -> str:
     return "; array.astype(float) makes numbers of what are" if dtype.kind == "O" else ""
 
 
-def real_array(given: Any, name: str, dtype: type[np.floating] = np.float32) -> npt.NDArray[Any]:
+def real_array(given: Any, name: str, dtype: type[np.floating] = np.float32) -> Array:
     """Return an array of real numbers of any kind as one of ``dtype``.
 
     Raises InputError where it is none, or holds finite numbers that are beyond ``dtype``.
@@ -134,9 +134,9 @@ class Calibration:
         Where it came from (run, bench, software versions), JSON-compatible.
     """
 
-    psfs: npt.NDArray[np.float32]
-    source_positions_um: npt.NDArray[np.float64]
-    background: npt.NDArray[np.float32] | None = None
+    psfs: Float32Array
+    source_positions_um: Float64Array
+    background: Float32Array | None = None
     geometry: Geometry = field(default_factory=Geometry)
     quality: Mapping[str, Any] = field(default_factory=dict)
     provenance: Mapping[str, Any] = field(default_factory=dict)

@@ -146,6 +146,19 @@ def headings(page: str) -> set[str]:
     return {re.sub(r"[^\w\- ]", "", heading.strip().lower()).replace(" ", "-") for heading in plain}
 
 
+def test_types_of_arrays_have_one_home() -> None:
+    home = module_files(ROOT)["recon.arrays"]
+    there = {ast.unparse(node.value) for node in parsed(home).body if isinstance(node, ast.Assign)}
+    again = [
+        f"{path.relative_to(ROOT)}:{node.lineno}"
+        for name, path in module_files(ROOT).items()
+        if path != home and (name.startswith("drivers.simulated") or not name.startswith("drivers"))
+        for node in parsed(path).body
+        if isinstance(node, ast.Assign) and ast.unparse(node.value) in there
+    ]
+    assert not again, f"recon.arrays has it: {again}"
+
+
 def test_every_link_between_pages_leads_somewhere() -> None:
     lost = []
     for page in (*ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md")):

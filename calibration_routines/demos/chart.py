@@ -5,10 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import TYPE_CHECKING
 
-import numpy as np
-import numpy.typing as npt
-
 from instrument.evaluation.chart import ChartData
+from recon.arrays import Float32Array
 from recon.base.blocks import block_mean
 from recon.errors import InputError
 from recon.evaluation.chart_reconstruction import ChartProblem
@@ -29,7 +27,7 @@ PRIORS = ("tv", "nonnegative")
 def chart_of(
     photo: Photograph,
     calibration: Calibration,
-    truth: npt.NDArray[np.float32],
+    truth: Float32Array,
     budget_s: float,
     on_progress: Callable[[float], object],
 ) -> ChartData:

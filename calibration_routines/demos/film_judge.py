@@ -7,13 +7,11 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from instrument.reconstruction.activity import Activity
+from recon.arrays import BoolArray, Float32Array, Float64Array
 from recon.optics.animal import Animal
 from recon.streams.activity import PERCENTILE, baseline, change, fading, floor_of
-
-Floats = npt.NDArray[np.float64]
 
 CLEAR_DIAMETERS = 3.0
 """A cell stands clear that has nothing else that glows within so many of its diameters across."""
@@ -45,12 +43,12 @@ class Truth:
         ``ROI_UM`` on the reconstruction's pixels.
     """
 
-    cells_px: Floats
-    tissue_px: Floats
-    vessel_px: Floats
-    change: Floats
-    clear: npt.NDArray[np.bool_]
-    speed_um_s: Floats
+    cells_px: Float64Array
+    tissue_px: Float64Array
+    vessel_px: Float64Array
+    change: Float64Array
+    clear: BoolArray
+    speed_um_s: Float64Array
     vessel_step_um: float
     roi_px: float
 
@@ -79,8 +77,8 @@ class Judged:
     kymograph : ndarray, (n_frames, n_places)
     """
 
-    traces: Floats
-    correlation: Floats
+    traces: Float64Array
+    correlation: Float64Array
     followed_clear: float
     clear_active: int
     active: int
@@ -88,10 +86,10 @@ class Judged:
     on_tissue: int
     elsewhere: int
     cells_found: int
-    speed_um_s: Floats
+    speed_um_s: Float64Array
     median_um_s: float
     true_median_um_s: float
-    kymograph: Floats
+    kymograph: Float64Array
 
     def figures(self) -> dict[str, Any]:
         """Return the numbers, JSON-compatible."""
@@ -111,7 +109,7 @@ class Judged:
 
 
 def truth_of(
-    animal: Animal, times_s: Floats, centre: tuple[int, int], pixel_um: float, distance_um: float
+    animal: Animal, times_s: Float64Array, centre: tuple[int, int], pixel_um: float, distance_um: float
 ) -> Truth:
     """Return what a film shall show.
 
@@ -125,7 +123,7 @@ def truth_of(
         Pixel pitch on the sensor, as reconstructed, and the diffuser's distance from it.
     """
 
-    def seen(places: Floats) -> Floats:
+    def seen(places: Float64Array) -> Float64Array:
         sensor = -places[:, :2] * (distance_um / places[:, 2:]) / pixel_um
         return np.column_stack([centre[0] + sensor[:, 1], centre[1] + sensor[:, 0]])
 
@@ -203,18 +201,18 @@ def judge(activity: Activity, truth: Truth, period_s: float, window: int) -> Jud
     )
 
 
-def _around(frames: npt.NDArray[np.float32], place: Floats, roi_px: float) -> npt.NDArray[np.float32]:
+def _around(frames: Float32Array, place: Float64Array, roi_px: float) -> Float32Array:
     """Return the light about a place in each frame, weighted by a Gaussian."""
     row, column = np.round(place).astype(int)
     reach = int(3 * roi_px) + 1
     box = np.s_[:, max(row - reach, 0) : row + reach + 1, max(column - reach, 0) : column + reach + 1]
     y, x = np.mgrid[box[1:]]
     weight = np.exp(-((y - place[0]) ** 2 + (x - place[1]) ** 2) / (2 * roi_px**2))
-    light: npt.NDArray[np.float32] = np.tensordot(frames[box], (weight / weight.sum()).astype(np.float32), 2)
+    light: Float32Array = np.tensordot(frames[box], (weight / weight.sum()).astype(np.float32), 2)
     return light
 
 
-def _along(frames: npt.NDArray[np.float32], places: Floats) -> Floats:
+def _along(frames: Float32Array, places: Float64Array) -> Float64Array:
     """Return the light along a line in each frame, less what does not change there."""
     from scipy import ndimage
 
@@ -222,7 +220,7 @@ def _along(frames: npt.NDArray[np.float32], places: Floats) -> Floats:
     return np.asarray(light - light.mean(axis=0), np.float64)
 
 
-def _speed(kymograph: Floats, step_um: float, period_s: float) -> Floats:
+def _speed(kymograph: Float64Array, step_um: float, period_s: float) -> Float64Array:
     """Return the speed between successive frames, (n_frames - 1,): the shift that lays one on the next.
 
     It is looked for among shifts of either sign by up to a twelfth of the line, by the correlation of what

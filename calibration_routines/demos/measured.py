@@ -5,12 +5,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
 from calibration_routines.demos.settings import GREEN
 from calibration_routines.optics.field_response import FieldResponse
 from calibration_routines.optics.photograph import Photograph
 from calibration_routines.psf.sweep import SweepCalibration
+from recon.arrays import Float32Array
 
 
 @dataclass(frozen=True, slots=True)
@@ -28,7 +28,7 @@ class Measured:
     """Of the sensor to red, green and blue, from its data sheet."""
 
     @property
-    def colours(self) -> npt.NDArray[np.float32]:
+    def colours(self) -> Float32Array:
         """The three photographs as one measurement, (height, width, 3), each as if exposed as the green one.
 
         The colours are balanced by the sensor's sensitivity.

@@ -6,16 +6,16 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
-import numpy.typing as npt
 
 from drivers.simulated.world import SimulatedWorld
+from recon.arrays import Float32Array
 from recon.base.metrics import psnr, scale_to, ssim
 
 if TYPE_CHECKING:
     from calibration_routines.demos.measured import Measured
     from calibration_routines.demos.settings import DemoSettings
 
-Float = npt.NDArray[np.float32]
+Float = Float32Array
 
 
 @dataclass(frozen=True, slots=True)

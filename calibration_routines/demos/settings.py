@@ -9,10 +9,10 @@ from typing import Any
 
 import cv2
 import numpy as np
-import numpy.typing as npt
 
 from calibration_routines.demos.volume import Lights
 from calibration_routines.psf.sweep_options import AxialSweep
+from recon.arrays import Float32Array
 from recon.base.declare import option
 from recon.optics.scene import Scene, picture
 
@@ -133,7 +133,7 @@ time_scale = {self.time_scale:g}
 """
 
 
-def read_picture() -> npt.NDArray[np.float32]:
+def read_picture() -> Float32Array:
     """Return the demo's picture as light from a screen: linear, 0 to 1, (280, 420, 3) float32."""
     levels = cv2.imread(str(PICTURE), cv2.IMREAD_COLOR)
     if levels is None:

@@ -5,9 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
 from recon import Reconstruction
+from recon.arrays import Float32Array, Float64Array
 from recon.optics.scene import Beads, Scene
 from recon.types import Calibration
 
@@ -34,10 +34,10 @@ class Placed:
         The volume in light that reaches the sensor: a far light is not dimmer for its distance.
     """
 
-    pixels: npt.NDArray[np.float64]
-    planes: npt.NDArray[np.float64]
-    found: npt.NDArray[np.float64]
-    seen: npt.NDArray[np.float32]
+    pixels: Float64Array
+    planes: Float64Array
+    found: Float64Array
+    seen: Float32Array
 
     @property
     def in_plane(self) -> int:
@@ -62,7 +62,7 @@ class Lights:
     z_um: tuple[float, ...]
     tangents: tuple[float, float]
 
-    def positions_um(self) -> npt.NDArray[np.float64]:
+    def positions_um(self) -> Float64Array:
         """Return x, y and z of every light, (count, 3), the nearest first."""
         way = np.linspace(0.0, 1.0, self.count)
         z = 1.0 / ((1 - way) / self.z_um[0] + way / self.z_um[-1])
@@ -93,7 +93,7 @@ class Lights:
         return Placed(pixels, planes, found, seen)
 
 
-def _mean_plane(seen: npt.NDArray[np.float32], row: float, column: float) -> float:
+def _mean_plane(seen: Float32Array, row: float, column: float) -> float:
     rows, columns = (
         slice(max(0, round(at) - REACH_PX), round(at) + REACH_PX + 1) for at in (float(row), float(column))
     )

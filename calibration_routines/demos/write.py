@@ -6,7 +6,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
-import numpy.typing as npt
 
 from instrument.evaluation.chart import colours_of
 from instrument.evaluation.chart_figure import draw_chart
@@ -23,6 +22,7 @@ from instrument.files.figures import (
 from instrument.files.images import write_image
 from instrument.files.seen import as_seen, srgb
 from instrument.reconstruction.result_figures import in_colour_of_depth
+from recon.arrays import Float32Array, Float64Array
 from recon.evaluation.scored import SECONDS
 
 if TYPE_CHECKING:
@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from calibration_routines.demos.picture import Viewer
     from calibration_routines.demos.result import DemoResult
 
-Float = npt.NDArray[np.float32]
+Float = Float32Array
 _SCREEN_GAMMA = 1 / 2.2  # light to the levels of a screen
 _MARGIN = 4  # dark pixels shown around the picture
 _LIGHT_PX = 0.7  # a true light is drawn as a disc of this radius
@@ -141,7 +141,7 @@ def _lights(done: DemoResult) -> list[Panel]:
     ]
 
 
-def _coloured(seen: Float) -> npt.NDArray[np.float64]:
+def _coloured(seen: Float) -> Float64Array:
     """Return a volume's brightest light over depth in colours of its depth, upright, points made visible."""
     from scipy.ndimage import maximum_filter
 

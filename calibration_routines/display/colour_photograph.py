@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from calibration_routines.display.display_io import DisplayBench
 from calibration_routines.display.hologram_photograph import (
@@ -25,10 +24,9 @@ from instrument.display.hologram_files import CHANNELS
 from instrument.files.errors import BenchError
 from instrument.files.images import write_image
 from instrument.files.pictures import Pixels
+from recon.arrays import Array, Float64Array
 from recon.holography import Scores
 from recon.holography.scores import compare
-
-Array = npt.NDArray[Any]
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,9 +53,9 @@ class ColourPattern:
 class ColourCapture:
     """A photographed picture in colour."""
 
-    seen: npt.NDArray[np.float64]
+    seen: Float64Array
     """(height, width, colours): as an eye would see it, each colour's white 1, in linear light."""
-    wanted: npt.NDArray[np.float64]
+    wanted: Float64Array
     """The picture through the same low-pass."""
     channels: tuple[Scores, ...]
     wavelengths_nm: tuple[float, ...]
@@ -140,7 +138,7 @@ def photograph_colours(
     )
 
 
-def _middle(image: Array, share: float, count: int) -> npt.NDArray[np.float64]:
+def _middle(image: Array, share: float, count: int) -> Float64Array:
     """Return the middle of a picture over its field, ``share`` of each side, as (count, count)."""
     from scipy.ndimage import map_coordinates
 

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -23,10 +22,9 @@ from instrument.files.errors import BenchError
 from instrument.files.slm_image import SlmCorrection, field_levels
 from instrument.reconstruction.preparation import darkest_block
 from instrument.runs.writer import dated_name, free_name
+from recon.arrays import Array, BoolArray
 from recon.holography import Display
 from recon.holography.camera_map import CameraMap, register_camera
-
-Array = npt.NDArray[Any]
 
 
 class DisplayBench:
@@ -173,12 +171,10 @@ class DisplayBench:
         """The camera's largest count."""
         return (1 << self.bench.camera.significant_bits) - 1
 
-    def saturated(self, photograph: Array) -> npt.NDArray[np.bool_]:
+    def saturated(self, photograph: Array) -> BoolArray:
         """Return which pixels of the photograph taken last, counts a millisecond, are at full scale."""
         dark = 0.0 if self._dark is None else self._dark[1]
-        found: npt.NDArray[np.bool_] = (
-            photograph * self.bench.camera.exposure_ms + dark >= self.full_scale - 0.5
-        )
+        found: BoolArray = photograph * self.bench.camera.exposure_ms + dark >= self.full_scale - 0.5
         return found
 
     def exposure_ms(self, mean_per_ms: float) -> float:

@@ -4,10 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from calibration_routines.display.display_io import DisplayBench, bring_mask, require_slm, writable
 from calibration_routines.display.hologram_photograph import HologramCamera
@@ -23,6 +21,7 @@ from instrument.files.atomic import named_by_worth, require_new
 from instrument.files.record import plain
 from instrument.files.slm_image import load_slm_correction
 from instrument.runs.run_control import RunControl
+from recon.arrays import Array
 from recon.base.declare import option
 from recon.holography import Display
 from recon.holography.learn import Lesson, learn_display, learning_work
@@ -181,7 +180,7 @@ def learned_alignment(place: Alignment, nominal: Display, lesson: Lesson, *, cor
     """Return an alignment with what was learned; as it was where nothing was."""
     if not lesson.helps or lesson.display.displacement is None:
         return place
-    rest: npt.NDArray[Any] = lesson.display.displacement - place.pose.displacement(nominal.mask.shape)
+    rest: Array = lesson.display.displacement - place.pose.displacement(nominal.mask.shape)
     return replace(place, rest=rest, learned=lesson.display.learned, corrected=corrected)
 
 

@@ -24,12 +24,12 @@ from instrument.files.errors import BenchError
 from instrument.files.images import write_image
 from instrument.files.pictures import Pixels
 from instrument.files.slm_image import field_levels, is_of_mirrors, write_slm_image
+from recon.arrays import Array, Float64Array
 from recon.holography import Display, HologramModel, HologramOptions, Scores, Target, compute_hologram
 from recon.holography.camera_map import CameraMap
 from recon.holography.scores import compare, low_pass
 from recon.holography.target import Band, make_band
 
-Array = npt.NDArray[Any]
 _GAIN = 0.8  # part of what a photograph lacked that is asked for beyond
 _ITERATIONS = 15  # between two photographs
 
@@ -38,10 +38,10 @@ _ITERATIONS = 15  # between two photographs
 class Capture:
     """A photographed hologram."""
 
-    seen: npt.NDArray[np.float64]
+    seen: Float64Array
     """(height, width): low-passed picture over the field of view (of mirrors, where the target counts), the
     axis in the middle, in units of the target's white."""
-    wanted: npt.NDArray[np.float64]
+    wanted: Float64Array
     """The target on the same grid, low-passed."""
     scores: Scores
     saturated_fraction: float
@@ -156,14 +156,14 @@ class HologramCamera:
         return Refinement(best_slm, first, best, tuple(history), ended_by)
 
 
-def wanted_picture(target: Target, display: Display) -> tuple[npt.NDArray[np.float64], float]:
+def wanted_picture(target: Target, display: Display) -> tuple[Float64Array, float]:
     """Return the low-passed target on the smallest grid that holds it, and its peak."""
     band = make_band(display.slm_shape, display.factor, "alias-free")
     spectrum, peak = target.spectrum(display, band)
     return low_passed_picture(spectrum, band, display.slm_shape), peak
 
 
-def low_passed_picture(lags: Array, band: Band, slm_shape: tuple[int, int]) -> npt.NDArray[np.float64]:
+def low_passed_picture(lags: Array, band: Band, slm_shape: tuple[int, int]) -> Float64Array:
     """Return the picture of a band's lags through the eye's low-pass, the axis in the middle."""
     height, width = band.seen_shape
     half = np.zeros((height, width // 2 + 1), complex)

@@ -19,7 +19,6 @@ from types import TracebackType
 from typing import Any, Protocol, Self
 
 import numpy as np
-import numpy.typing as npt
 
 from drivers.errors import StoppedError
 from drivers.frame import FrameMetadata
@@ -32,10 +31,9 @@ from instrument.runs.run import FinishReason, Run
 from instrument.runs.run_control import EndedEarlyError
 from instrument.runs.run_files import BENCH_TOML
 from instrument.runs.writer import FrameToStore, RunWriter
+from recon.arrays import Array
 from recon.base.declare import RARE, option
 from recon.base.option_text import command_line
-
-Array = npt.NDArray[Any]
 
 _ASKED = "asked"
 

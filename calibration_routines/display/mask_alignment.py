@@ -25,14 +25,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
-from calibration_routines.display.display_io import (
-    DisplayBench,
-    approach_from_below,
-    require_slm,
-    writable,
-)
+from calibration_routines.display.display_io import DisplayBench, approach_from_below, require_slm, writable
 from calibration_routines.display.kept_frames import KeptFrames, kept_words
 from calibration_routines.display.mask_search import (
     ALIGNMENT_FILE,
@@ -60,6 +54,7 @@ from instrument.files.atomic import named_by_worth, require_new
 from instrument.files.record import plain
 from instrument.files.slm_image import load_slm_correction
 from instrument.runs.run_control import EndedEarlyError, RunControl
+from recon.arrays import Float64Array
 from recon.errors import InputError
 from recon.holography import Display
 from recon.holography.camera_map import CameraMap
@@ -69,9 +64,8 @@ from recon.holography.sections import SmoothField
 
 __all__ = ["AlignmentFailedError", "AlignmentReport", "AlignmentSettings", "MaskAlignment"]
 
-Array = npt.NDArray[Any]
 
-Field = npt.NDArray[np.float64]
+Field = Float64Array
 
 LAST_MOVES = 2
 LAST_PICTURES = 4
@@ -89,9 +83,9 @@ class AlignmentReport:
 
     pose: Pose
     """What is left, with the stage where it ended; holograms are to be computed with it."""
-    error: npt.NDArray[np.float64]
+    error: Float64Array
     """(8,): standard uncertainty of each parameter."""
-    rest: npt.NDArray[np.float64]
+    rest: Float64Array
     """(rows, columns, 2): smooth displacement beyond the pose's, on the nodes of
     :meth:`Pose.displacement`, mask pixels."""
     efficiency: float
@@ -139,7 +133,7 @@ class AlignmentReport:
             )
         return tuple(found)
 
-    def displacement(self, mask_shape: tuple[int, int]) -> npt.NDArray[np.float64]:
+    def displacement(self, mask_shape: tuple[int, int]) -> Float64Array:
         """Return the displacement field for :class:`recon.holography.Display`."""
         return self.pose.displacement(mask_shape) + self.rest
 
@@ -313,9 +307,7 @@ def _told(place: Mapping[str, float]) -> str:
     return ", ".join(f"{name} {value:.5g}" for name, value in place.items())
 
 
-def _place(
-    pose: Pose, smooth: SmoothField, mask_shape: tuple[int, int]
-) -> tuple[Pose, npt.NDArray[np.float64]]:
+def _place(pose: Pose, smooth: SmoothField, mask_shape: tuple[int, int]) -> tuple[Pose, Float64Array]:
     """Add a smooth field to a pose; the pose's own distortion becomes part of the rest."""
     plain = pose.with_(cubic=0.0)
     rest = smooth.rest + pose.displacement(mask_shape) - plain.displacement(mask_shape)

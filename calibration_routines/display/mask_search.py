@@ -10,10 +10,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from math import ceil
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from calibration_routines.display.display_io import DisplayBench
 from calibration_routines.display.kept_frames import SeenAgain
@@ -22,6 +20,7 @@ from calibration_routines.options import Checked, Size
 from calibration_routines.procedure import Listener
 from calibration_routines.scatter import Scatter, scatter_of
 from instrument.files.errors import BenchError
+from recon.arrays import Array, Float64Array
 from recon.base.declare import RARE, option
 from recon.holography import Display
 from recon.holography.place import FittedPlace, fit_place
@@ -234,7 +233,7 @@ class Measured:
     """A pose as measured."""
 
     pose: Pose
-    error: npt.NDArray[np.float64]
+    error: Float64Array
     """(8,): standard uncertainty of each parameter."""
     efficiency: float
     """Brightness of spots at the pose that was probed last, over the model's ideal."""
@@ -298,9 +297,7 @@ def measure_sections(session: AlignmentSession, pose: Pose) -> tuple[SmoothField
     return field, found
 
 
-def photograph_sections(
-    session: AlignmentSession, pose: Pose, rest: npt.NDArray[np.float64], pictures: int
-) -> None:
+def photograph_sections(session: AlignmentSession, pose: Pose, rest: Float64Array, pictures: int) -> None:
     """Take pictures of sections' spots about a place that is known well, for :func:`fit_photographs`."""
     sections = Sections(session.display.slm_shape, session.settings.division.shape)
     shifts = np.broadcast_to(hypotheses(0.45 * session.display.factor), (len(sections), 5, 2))
@@ -311,9 +308,7 @@ def photograph_sections(
         session.listener.said("sections")
 
 
-def fit_photographs(
-    session: AlignmentSession, pose: Pose, rest: npt.NDArray[np.float64]
-) -> FittedPlace | None:
+def fit_photographs(session: AlignmentSession, pose: Pose, rest: Float64Array) -> FittedPlace | None:
     """Fit the place to all light of the pictures of sections' spots; None where they do not tell it.
 
     ``pose`` and ``rest`` are what the spots themselves tell.
@@ -348,8 +343,6 @@ def measure_again(session: AlignmentSession, pose: Pose) -> Measured | None:
     error[[NAMES.index(name) for name in ("z_um", "pitch_mrad", "yaw_mrad")]] = fitted.deep_error
     return Measured(fitted.pose.plus(fitted.field.change), error, 1.0)
 
-
-Array = npt.NDArray[Any]
 
 SHORT_LIST = 24
 """Shifts that are tried with rotations: a mask at the largest rotation is seldom the brightest, but among

@@ -8,7 +8,6 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 import numpy as np
-import numpy.typing as npt
 
 from calibration_routines.display.display_io import approach_from_below
 from calibration_routines.display.mask_search import (
@@ -20,6 +19,7 @@ from calibration_routines.display.mask_search import (
 )
 from drivers.stage import Stage
 from instrument.files.sample_images import load_sample
+from recon.arrays import Float64Array
 from recon.holography import Display, Target
 from recon.holography.pose import NAMES, PlacedHologram, Pose
 from recon.holography.target import make_band
@@ -56,7 +56,7 @@ class PlacementCost:
         vector = self._in_place.pose.vector() + difference.vector()
         return psnr_db - self._in_place.psnr_db(Pose(*(float(v) for v in vector)))
 
-    def of_depth_db(self, pose: Pose, rest: npt.NDArray[np.float64]) -> float:
+    def of_depth_db(self, pose: Pose, rest: Float64Array) -> float:
         """Return what a hologram for a pose and the displacement beyond it loses to the pose's depth."""
         hologram = self._compute(pose, rest)
         return hologram.psnr_db(pose.with_(z_um=0.0)) - hologram.psnr_db(pose)
@@ -64,9 +64,9 @@ class PlacementCost:
     def lost_db(
         self,
         pose: Pose,
-        deep_error: npt.NDArray[np.float64],
-        rest: npt.NDArray[np.float64],
-        modes: npt.NDArray[np.float64],
+        deep_error: Float64Array,
+        rest: Float64Array,
+        modes: Float64Array,
     ) -> float:
         """Return what a hologram computed with a result loses to what remains, on average.
 
@@ -83,11 +83,11 @@ class PlacementCost:
             off = pose.with_(
                 z_um=pose.z_um + z, pitch_mrad=pose.pitch_mrad + pitch, yaw_mrad=pose.yaw_mrad + yaw
             )
-            error: npt.NDArray[np.float64] = np.tensordot(rng.normal(size=len(modes)), modes, 1)
+            error: Float64Array = np.tensordot(rng.normal(size=len(modes)), modes, 1)
             seen.append(hologram.psnr_db(off, error))
         return hologram.psnr_db(flat) - float(np.mean(seen))
 
-    def _compute(self, pose: Pose, rest: npt.NDArray[np.float64] | None = None) -> PlacedHologram:
+    def _compute(self, pose: Pose, rest: Float64Array | None = None) -> PlacedHologram:
         return PlacedHologram(self.display, self._target, pose, rest, iterations=ITERATIONS)
 
 
@@ -184,7 +184,7 @@ class MaskStage:
     def _unlike(self, a: Measured, b: Measured, steps: Values) -> dict[str, tuple[float, float]]:
         """Return what axes did that did not do what they were asked for, and how sure that is."""
         before, after = self.values(a.pose), self.values(b.pose)
-        total: npt.NDArray[np.float64] = np.hypot(a.error, b.error)
+        total: Float64Array = np.hypot(a.error, b.error)
         error = self.values(Pose(*(float(v) for v in total)))
         went = {name: (after[name] - before[name], error[name]) for name in steps}
         return {

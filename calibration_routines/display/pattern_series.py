@@ -36,14 +36,14 @@ from calibration_routines.scatter import (
     reduction,
     steadied,
 )
+from recon.arrays import Float32Array, Float64Array
 from recon.base.blocks import block_mean
 from recon.camera.registration import moved
 from recon.holography.camera_map import CameraMap
 from recon.holography.learn import Look
 from recon.holography.target import Band, make_band
 
-Float = npt.NDArray[np.float32]
-Floats = npt.NDArray[np.float64]
+Float = Float32Array
 Complexes = npt.NDArray[np.complex128]
 
 REFERENCE_EVERY = 4
@@ -232,7 +232,7 @@ def photograph_series(seen: HologramCamera, count: int, *, seed: int = 0) -> Pat
 
 
 def put_back(
-    looks: Sequence[Look], places_px: Sequence[Sequence[float]] | Floats, camera: CameraMap, band: Band
+    looks: Sequence[Look], places_px: Sequence[Sequence[float]] | Float64Array, camera: CameraMap, band: Band
 ) -> tuple[Look, ...]:
     """Return photographs moved back over the field, by (rows, columns) of camera pixels each, (n, 2)."""
     inverse = np.linalg.inv(camera.gradient(0.0, 0.0))
@@ -244,11 +244,11 @@ def put_back(
     return tuple(back)
 
 
-def _place(visit: Visit) -> Floats:
+def _place(visit: Visit) -> Float64Array:
     return np.array([visit.change.rows, visit.change.columns])
 
 
-def _places(visits: Sequence[Visit], at: Sequence[int], count: int) -> Floats:
+def _places(visits: Sequence[Visit], at: Sequence[int], count: int) -> Float64Array:
     """Return where each photograph lies from the first, (n, 2), by when it was shown."""
     shown = [(number, n) for n, number in enumerate(at)] + [(number, count) for number in range(1, count)]
     order = [visit for _, visit in sorted(shown)]  # a visit comes before the pattern of its number

@@ -3,21 +3,19 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from calibration_routines.display.display_io import DisplayBench
 from calibration_routines.display.slm_table import SlmCalibration
 from calibration_routines.display.spot_camera import SpotCamera
 from instrument.files.errors import BenchError
 from instrument.files.slm_image import SlmCorrection
+from recon.arrays import Array
 from recon.holography import Display
 from recon.holography.pose import Pose
 from recon.holography.slm_response import MODES, flatness_jacobian, mode
 
-Array = npt.NDArray[Any]
 FRAMES = 22
 """That it takes at most."""
 

@@ -4,17 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from calibration_routines.purpose import CalibrationError
 from calibration_routines.scatter import NO_CHANGE, Scatter, compare, pooled, scatter_of
+from recon.arrays import Array, Float64Array
 from recon.errors import InputError
 from recon.holography.slm_response import phases_from_frames
 
-Array = npt.NDArray[Any]
 MAX_PHASE_ERROR_RAD = 0.0022
 """Standard deviation of a phase beyond which no table is made. What flickers with the phase's own cosine and
 sine bends the whole table, unseen: two independent parts of this size, the worst level off by twice their
@@ -110,7 +108,7 @@ def _phases(frames: Array, references: Array, before: Array, scatter: Scatter) -
     return min(found, key=lambda one: one[1])
 
 
-def _flicker(levels: npt.NDArray[np.float64], at: npt.NDArray[np.float64]) -> float:
+def _flicker(levels: Float64Array, at: Float64Array) -> float:
     """Return the relative standard deviation of brightness beyond what changes evenly; 0 of two visits."""
     share = (at[1:-1] - at[:-2]) / (at[2:] - at[:-2])
     beside = levels[1:-1] - (1 - share) * levels[:-2] - share * levels[2:]

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -15,8 +14,8 @@ from calibration_routines.purpose import CalibrationError
 from calibration_routines.scatter import STEADY, Scatter
 from instrument.files.errors import BenchError
 from instrument.files.slm_image import SlmCorrection
+from recon.arrays import Array, Float64Array
 
-Array = npt.NDArray[Any]
 REFERENCE_EVERY = 8
 """Levels between two pictures of level 0."""
 
@@ -28,7 +27,7 @@ class SlmCalibration:
     correction: SlmCorrection
     levels: npt.NDArray[np.int64]
     """(n,): grey levels measured."""
-    phases_rad: npt.NDArray[np.float64]
+    phases_rad: Float64Array
     """(n,): their phases."""
     flatness_rms_rad: float | None
     """Of the flatness error found; None when it was not measured."""

@@ -5,12 +5,11 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from math import ceil
-from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from calibration_routines.display.display_io import DisplayBench, find_camera, random_brightness
+from recon.arrays import Array
 from recon.holography import Display
 from recon.holography.camera_map import CameraMap
 from recon.holography.learn import Look
@@ -18,8 +17,6 @@ from recon.holography.pose import Pose
 from recon.holography.sections import Sections
 from recon.holography.spots import Spot, SpotMaker, spread_spots
 from recon.holography.target import make_band
-
-Array = npt.NDArray[Any]
 
 
 @dataclass(frozen=True, slots=True)

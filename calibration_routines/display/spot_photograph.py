@@ -9,7 +9,6 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from math import ceil
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -17,12 +16,12 @@ import numpy.typing as npt
 from calibration_routines.display.display_io import DisplayBench, find_camera, random_brightness
 from instrument.display.hologram import CaptureOptions
 from instrument.files.images import write_image
+from recon.arrays import Array, BoolArray, Float64Array
 from recon.errors import InputError
 from recon.holography import Display, HologramOptions, SpotList, compute_spots
 from recon.holography.camera_map import CameraMap, polynomial_map
 from recon.holography.spot_list import SpotField, brighter_where_dim
 
-Array = npt.NDArray[Any]
 _SIDE, _REACH = 4, 0.36
 """Single spots along each axis that the camera is registered by, and how far from the axis they lie."""
 _CLEAR = 12.0
@@ -51,8 +50,8 @@ class PhotographedSpots:
     """
 
     slm: npt.NDArray[np.complex64]
-    frame: npt.NDArray[np.float64]
-    relative: npt.NDArray[np.float64]
+    frame: Float64Array
+    relative: Float64Array
     deviations: tuple[float, ...]
     camera_residual_px: float
     ended_by: BaseException | None = None
@@ -151,14 +150,14 @@ def register_by_spots(io: DisplayBench, display: Display) -> CameraMap:
     return polynomial_map(nominal, places[good] - 0.5, np.array(shifts)[good])
 
 
-def _about(shape: tuple[int, ...], place: tuple[Array, Array], reach: float) -> npt.NDArray[np.bool_]:
+def _about(shape: tuple[int, ...], place: tuple[Array, Array], reach: float) -> BoolArray:
     """Return which pixels lie within a reach of a place."""
     rows, columns = np.ogrid[: shape[0], : shape[1]]
-    near: npt.NDArray[np.bool_] = np.hypot(rows - float(place[0]), columns - float(place[1])) < reach
+    near: BoolArray = np.hypot(rows - float(place[0]), columns - float(place[1])) < reach
     return near
 
 
-def _exposed(io: DisplayBench, average: int) -> npt.NDArray[np.float64]:
+def _exposed(io: DisplayBench, average: int) -> Float64Array:
     """Return counts a millisecond, exposed so that the brightest pixel is well inside the camera's range."""
     low, high = io.bench.camera.exposure_limits_ms
     exposure_ms = float(np.clip(io.bench.camera.exposure_ms, low, high))
@@ -185,7 +184,7 @@ class _Spots:
     camera: CameraMap
     average: int
 
-    def measure(self, slm: Array) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
+    def measure(self, slm: Array) -> tuple[Float64Array, Float64Array]:
         """Return the frames' sum, and each spot's brightness over what was asked for, mean 1."""
         total = np.zeros(self.io.bench.camera.image_shape)
         for field in slm:

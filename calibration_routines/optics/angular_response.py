@@ -8,13 +8,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
-import numpy.typing as npt
 from scipy import ndimage
 
 from calibration_routines.psf.sampling import Position
 from calibration_routines.purpose import CalibrationError
 from calibration_routines.scatter import STEADY, Scatter
 from instrument.files.record import RecordFormat, plain, value_of
+from recon.arrays import Float32Array, Float64Array
 from recon.camera.registration import Registration, aligned, expected_shift, register
 from recon.optics.fall_off import FallOff
 
@@ -36,8 +36,6 @@ _SMOOTH_PX, _SUPPORT = 6.0, 0.05  # the pattern is where its smoothed light is a
 _NEAR_PX = 40.0  # about where the stage says, the pattern is looked for
 _COLOURS = ("#00798c", "#d1495b")
 _LEAST = 1e-4  # below it a response's logarithm would be noise
-
-Floats = npt.NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True)
@@ -78,7 +76,7 @@ class Curve:
         reached = [angle for angle in self.cut_offs_deg() if angle is not None]
         return float(np.mean(reached)) if reached else None
 
-    def folded(self) -> tuple[Floats, Floats]:
+    def folded(self) -> tuple[Float64Array, Float64Array]:
         """Return angles from 0 upwards, radians, and the mean response of both sides there."""
         magnitude = np.abs(np.array(self.angles_deg))
         values = np.array(self.response)
@@ -116,7 +114,7 @@ class AngularResponse:
         """
         log_x, log_y = (_logarithm(*curve.folded()) for curve in (self.along_x, self.along_y))
 
-        def response(tan_y: Floats, tan_x: Floats) -> Floats:
+        def response(tan_y: Float64Array, tan_x: Float64Array) -> Float64Array:
             squared = tan_y**2 + tan_x**2
             angle = np.arctan(np.sqrt(squared))
             part = np.divide(tan_x**2, squared, out=np.zeros_like(squared), where=squared > 0)
@@ -125,11 +123,11 @@ class AngularResponse:
         return response
 
 
-def _logarithm(angles: Floats, values: Floats) -> Callable[[Floats], Floats]:
+def _logarithm(angles: Float64Array, values: Float64Array) -> Callable[[Float64Array], Float64Array]:
     """Return the response's logarithm as a function of the angle."""
     squares, logs = angles**2, np.log(np.maximum(values, _LEAST))
 
-    def logarithm(angle: Floats) -> Floats:
+    def logarithm(angle: Float64Array) -> Float64Array:
         inside = np.interp(angle**2, squares, logs)
         return np.where(angle <= angles[-1], inside, logs[-1] * angle**2 / squares[-1])
 
@@ -157,7 +155,7 @@ def load_response(file: Path | str) -> AngularResponse:
 
 # Measuring -------------------------------------------------------------------------------------------
 def analyse_angular(
-    images: Sequence[npt.NDArray[np.float32]],
+    images: Sequence[Float32Array],
     points_um: Sequence[Position],
     *,
     pitch_um: float,
@@ -203,9 +201,9 @@ def analyse_angular(
 
 
 def _compare(
-    image: npt.NDArray[np.float32],
-    axis_image: npt.NDArray[np.float32],
-    axis_bare: Floats,
+    image: Float32Array,
+    axis_image: Float32Array,
+    axis_bare: Float64Array,
     point: Position,
     origin: Position,
     pitch_um: float,
@@ -235,13 +233,13 @@ def _compare(
 
 def _geometric(
     point: Position, shape: tuple[int, ...], pitch_um: float, distance_um: float, emission: Emission
-) -> Floats:
+) -> Float64Array:
     """Light from the source on each pixel without any response: a power of the ray's cosine."""
     tangents = _tangents(point, shape, pitch_um, distance_um)
     return np.asarray((1 + tangents[0] ** 2 + tangents[1] ** 2) ** (-0.5 * _POWER[emission]))
 
 
-def _tangent(point: Position, shape: tuple[int, ...], pitch_um: float, distance_um: float) -> Floats:
+def _tangent(point: Position, shape: tuple[int, ...], pitch_um: float, distance_um: float) -> Float64Array:
     """Signed tangent of the incidence along the axis on which the source was moved, (height, width)."""
     y, x = _tangents(point, shape, pitch_um, distance_um)
     return -np.broadcast_to(x if abs(point[0]) >= abs(point[1]) else y, shape)
@@ -249,7 +247,7 @@ def _tangent(point: Position, shape: tuple[int, ...], pitch_um: float, distance_
 
 def _tangents(
     point: Position, shape: tuple[int, ...], pitch_um: float, distance_um: float
-) -> tuple[Floats, Floats]:
+) -> tuple[Float64Array, Float64Array]:
     """Tangents of the straight ray from the source to each pixel, along y (h, 1) and x (1, w)."""
     x, y, z = point
     rows, columns = (np.asarray((np.arange(n) - (n - 1) / 2) * pitch_um, np.float64) for n in shape)
@@ -257,12 +255,12 @@ def _tangents(
     return np.asarray(tan_y, np.float64), np.asarray(tan_x, np.float64)
 
 
-def _displaced(image: Floats, shift: tuple[float, float]) -> npt.NDArray[np.float32]:
+def _displaced(image: Float64Array, shift: tuple[float, float]) -> Float32Array:
     """Move an image by ``(rows, columns)``; aligned() takes a displacement back, so it gets the opposite."""
     return aligned(image.astype(np.float32), Registration(-shift[0], -shift[1], 1.0, 1.0, 1.0))
 
 
-def _part_seen(image: Floats, shift: tuple[float, float]) -> float:
+def _part_seen(image: Float64Array, shift: tuple[float, float]) -> float:
     """Return the part of an image's light that is left when it is displaced."""
     return float(_displaced(image, shift).sum(dtype=np.float64) / image.sum())
 

@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
-import numpy.typing as npt
 
 from calibration_routines.optics.photograph import (
     Photograph,
@@ -33,11 +32,10 @@ from instrument.files.record import RecordFormat, plain
 from instrument.runs.results import BEADS_FILE
 from instrument.runs.run import Run
 from instrument.runs.run_control import RunControl
+from recon.arrays import Array, Float32Array
 from recon.base.declare import RARE, option
 from recon.blind import BlindSettings
 from recon.types import Geometry
-
-Floats = npt.NDArray[np.float32]
 
 BEADS_FOLDER = "calibration-beads"
 """Where the command line writes the calibration."""
@@ -213,7 +211,7 @@ def went_on(run: Path, where: Path) -> None:
 class BeadPhotographs:
     """What was photographed of slides of beads."""
 
-    images: Floats
+    images: Float32Array
     """(n_images, height, width): dark frame subtracted, colours averaged, binned."""
     runs: tuple[Path, ...] = ()
     findings: tuple[str, ...] = ()
@@ -363,7 +361,7 @@ def show_slide_again(run: Run, bench: Bench, _first: int) -> None:
         bench.ask(f"{of} goes on: the bead slide must lie as it lay for its first frames.")
 
 
-def mean_images(frames: Sequence[npt.NDArray[Any]]) -> Floats:
+def mean_images(frames: Sequence[Array]) -> Float32Array:
     """Stack grey or colour images of one shape as float32, colours averaged.
 
     Raises BenchError when shapes differ.

@@ -11,7 +11,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from calibration_routines.optics.bead_photographs import (
     BEADS,
@@ -36,12 +35,12 @@ from instrument.files.record import plain
 from instrument.runs.run import Run
 from instrument.runs.run_control import RunControl
 from instrument.runs.writer import dated_name, free_name
+from recon.arrays import Float32Array
 from recon.base.declare import option
 from recon.blind import BlindResult, calibrate_from_beads
 from recon.blind.made_up import LEAST_ALIKE, MOST_BEADS
 from recon.types import Calibration, Geometry
 
-Floats = npt.NDArray[np.float32]
 Progress = Callable[[str, float], object]
 
 MANY_PX = 1_000_000
@@ -82,7 +81,7 @@ class BeadCalibration:
 
 
 def calibrate_beads(
-    images: Floats,
+    images: Float32Array,
     slides: BeadSlides,
     geometry: Geometry,
     *,

@@ -13,7 +13,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
-import numpy.typing as npt
 
 from calibration_routines.options import Checked
 from calibration_routines.planned import outlook_of
@@ -38,6 +37,7 @@ from instrument.runs.results import SURFACE_FILE
 from instrument.runs.run import Run
 from instrument.runs.run_control import RunControl
 from recon.analysis.dpc import SIDES, DpcOptics, deflections_deg, phase_from_halves, slopes_deg
+from recon.arrays import Float32Array, Float64Array
 from recon.base.blocks import block_mean
 from recon.base.declare import RARE, option
 
@@ -58,8 +58,6 @@ _SHAKEN_PX = 1.0  # smooth pictures that shake by less change by less than 1 %
 _TARGET = 0.6  # of full scale: halves differ in brightness where the sample deflects
 _COLOURS = ("#00798c", "#d1495b")
 _EDGE_QUANTILE = 0.999  # the largest deflection, less the outliers that noise makes
-
-Image = npt.NDArray[np.float32]
 
 
 @dataclass(frozen=True)
@@ -91,14 +89,14 @@ class DpcSetup(Checked):
 class DiffuserSurface:
     """What was measured."""
 
-    height_um: Image
+    height_um: Float32Array
     """(height, width): relative to the plane that fits best."""
-    phase_rad: Image
+    phase_rad: Float32Array
     """(height, width)."""
     pitch_um: float
     """In the sample."""
-    slope_deg: npt.NDArray[np.float64]
-    deflection_deg: npt.NDArray[np.float64]
+    slope_deg: Float64Array
+    deflection_deg: Float64Array
     """(height, width): magnitudes of the surface's slope, and of a normal ray's deflection."""
     bench: str = ""
     simulated: bool = False
@@ -115,7 +113,7 @@ class DiffuserSurface:
         }
 
 
-def half_width_deg(deflection_deg: npt.NDArray[np.float64]) -> float:
+def half_width_deg(deflection_deg: Float64Array) -> float:
     """Return the half width at half maximum of the deflection along one axis, degrees.
 
     A Gaussian's, from the root mean square of both axes: a diffuser's data sheet gives this width.
@@ -263,7 +261,7 @@ def _rgb(setup: DpcSetup) -> tuple[int, int, int]:
     return red, green, blue
 
 
-def _halves(run: Run, dark: DarkModel) -> tuple[dict[str, Image], Scatter]:
+def _halves(run: Run, dark: DarkModel) -> tuple[dict[str, Float32Array], Scatter]:
     halves, scatters = {}, []
     for side in SIDES:
         if np.any((run.images(side) >= full_scale(run)).any(axis=0) & ~dark.hot):
@@ -273,7 +271,7 @@ def _halves(run: Run, dark: DarkModel) -> tuple[dict[str, Image], Scatter]:
     return halves, pooled(scatters)
 
 
-def _steady(run: Run, label: str, dark: DarkModel) -> tuple[Image, Scatter]:
+def _steady(run: Run, label: str, dark: DarkModel) -> tuple[Float32Array, Scatter]:
     """Return a half's mean, and how its frames scatter.
 
     Halves are so smooth that noise hides where single pixels lie: blocks of them tell, but not well enough to
@@ -295,7 +293,7 @@ def _unlike(frames: int) -> tuple[str, ...]:
     )
 
 
-def _moved(run: Run, dark: DarkModel, first: Image) -> tuple[str, ...]:
+def _moved(run: Run, dark: DarkModel, first: Float32Array) -> tuple[str, ...]:
     """Return what the first half, taken again, says of the time between; nothing of runs without it."""
     steps = run.steps(AGAIN)
     if not steps:

@@ -24,6 +24,7 @@ from calibration_routines.purpose import CalibrationError, completed
 from instrument.bench.bench import Bench
 from instrument.runs.acquire import acquire
 from instrument.runs.run import Run
+from recon.arrays import Float32Array
 
 _KIND = "field response"
 _THEN = "The response of all its frames: calibration_routines.field_response_of(RUN)."
@@ -44,9 +45,7 @@ class FieldResponse:
     misfit: float
     """Largest relative departure of the measurements from the fit."""
 
-    def __call__(
-        self, tan_y: npt.NDArray[np.floating], tan_x: npt.NDArray[np.floating]
-    ) -> npt.NDArray[np.float32]:
+    def __call__(self, tan_y: npt.NDArray[np.floating], tan_x: npt.NDArray[np.floating]) -> Float32Array:
         """Return the response in a direction given by its tangents (broadcast against each other)."""
         return np.exp(-(self.along_x * tan_x**2 + self.along_y * tan_y**2)).astype(np.float32)
 
@@ -57,7 +56,7 @@ class FieldResponse:
         diffuser_distance_um: float,
         *,
         lambertian: bool = False,
-    ) -> npt.NDArray[np.float32]:
+    ) -> Float32Array:
         """Return the response on a reconstruction's grid, whose centre pixel ``n // 2`` is on the axis.
 
         ``lambertian`` adds what a flat screen has and the point source has not: it sends less light sideways,
@@ -178,7 +177,7 @@ def field_response_of(run: Run | Path | str) -> FieldResponse:
     return fit_field_response(points, [float(image.sum(dtype=np.float64)) for image in images])
 
 
-def _require_whole(light: npt.NDArray[np.float32], place: Position) -> None:
+def _require_whole(light: Float32Array, place: Position) -> None:
     clipped = measure_psf(light[np.newaxis], z_um=place[2], noise=0.0).clipped
     if clipped > MAX_CLIPPED:
         raise CalibrationError(

@@ -33,6 +33,7 @@ from instrument.runs.acquire import abilities_of, acquire
 from instrument.runs.results import PHOTOGRAPH_FILE
 from instrument.runs.run import Run
 from instrument.runs.run_control import RunControl
+from recon.arrays import Float32Array
 from recon.base.arguments import require_argument
 from recon.base.blocks import block_mean
 from recon.base.declare import RARE, option
@@ -42,7 +43,7 @@ from recon.base.declare import RARE, option
 class Photograph:
     """A measurement of a scene."""
 
-    measurement: npt.NDArray[np.float32]
+    measurement: Float32Array
     """(height, width) or (height, width, 3): mean of the frames minus the mean dark frame, counts;
     hot pixels replaced by their neighbours' median, then binned. Negative values are kept: they balance the
     noise."""

@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from calibration_routines.optics.beads import MANY_PX
 from calibration_routines.optics.screen_solve import DRIFT, SOLVING, ScreenOptions, psf_lines, saved
@@ -19,12 +18,11 @@ from instrument.files.atomic import require_new
 from instrument.files.errors import FileError
 from instrument.files.images import ImageFile, read_image
 from instrument.runs.run_control import RunControl
+from recon.arrays import Float32Array
 from recon.base.declare import RARE, option
 from recon.blind.known_pictures import PictureSettings, psf_from_pictures
 from recon.blind.left_out import POOR_DB, LeftOut, leave_out
 from recon.types import Calibration, Geometry
-
-Floats = npt.NDArray[np.float32]
 
 PHOTOGRAPHS, PICTURES = ("raw_", "photograph_"), ("truth_", "picture_")
 """What names of files begin with, before what a photograph and its picture have in common."""
@@ -88,8 +86,8 @@ class Pairs:
     """
 
     names: tuple[str, ...]
-    photographs: Floats
-    pictures: Floats
+    photographs: Float32Array
+    pictures: Float32Array
     simulated: bool
 
 
@@ -144,7 +142,7 @@ def _named(folder: Path, beginnings: Sequence[str]) -> dict[str, Path]:
     return found
 
 
-def _of_shape(image: ImageFile, first: ImageFile) -> Floats:
+def _of_shape(image: ImageFile, first: ImageFile) -> Float32Array:
     if image.pixels.shape != first.pixels.shape:
         raise FileError(
             image.path,

@@ -10,11 +10,11 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
+from recon.arrays import Float32Array, Float64Array
 from recon.base.blocks import block_mean
 
 Levels = npt.NDArray[np.uint8]
-Floats = npt.NDArray[np.float64]
-Light = npt.NDArray[np.float32]
+Light = Float32Array
 
 LIT_CELLS = 0.2
 LEAST_MARKS = 6
@@ -40,7 +40,7 @@ class ScreenMap:
     """Root mean square distance of the marks from it."""
 
     @classmethod
-    def of_marks(cls, screen: Floats, sensor: Floats) -> ScreenMap | None:
+    def of_marks(cls, screen: Float64Array, sensor: Float64Array) -> ScreenMap | None:
         """Fit marks' places (n, 2), each (row, column); marks far from the fit are left out.
 
         None where fewer than :data:`LEAST_MARKS` agree on a map.
@@ -57,11 +57,11 @@ class ScreenMap:
         off = found.on_sensor(screen[inside]) - sensor[inside]
         return cls(found.matrix, count, float(np.sqrt((off**2).sum(axis=1).mean())))
 
-    def on_sensor(self, places: Floats) -> Floats:
+    def on_sensor(self, places: Float64Array) -> Float64Array:
         """Return where places on the screen are seen, (..., 2) rows and columns both."""
         return _mapped(np.array(self.matrix), places)
 
-    def on_screen(self, places: Floats) -> Floats:
+    def on_screen(self, places: Float64Array) -> Float64Array:
         """Return which places of the screen are seen at places of the sensor, likewise."""
         return _mapped(np.linalg.inv(np.array(self.matrix)), places)
 
@@ -103,10 +103,10 @@ class ScreenMap:
         return np.asarray(block_mean(fine, finer * binning), np.float32)
 
 
-def _mapped(matrix: Floats, places: Floats) -> Floats:
+def _mapped(matrix: Float64Array, places: Float64Array) -> Float64Array:
     flat = np.asarray(places, np.float64).reshape(-1, 2)[:, ::-1]
     mapped = np.column_stack([flat, np.ones(len(flat))]) @ matrix.T
-    found: Floats = (mapped[:, :2] / mapped[:, 2:])[:, ::-1].reshape(np.shape(places))
+    found: Float64Array = (mapped[:, :2] / mapped[:, 2:])[:, ::-1].reshape(np.shape(places))
     return found
 
 
@@ -154,7 +154,7 @@ def bars(shape: tuple[int, int], count: int, axis: int) -> list[Levels]:
     return pictures
 
 
-def field_along(light: Floats, side: int) -> tuple[float, float]:
+def field_along(light: Float64Array, side: int) -> tuple[float, float]:
     """Return where along a side of the screen the camera sees it: where a bar gives half the most light.
 
     ``light`` is what each of :func:`bars` gave, in order.

@@ -8,7 +8,6 @@ from collections.abc import Iterator
 
 import cv2
 import numpy as np
-import numpy.typing as npt
 
 from calibration_routines.display.display_io import require_slm
 from calibration_routines.optics.screen_pictures import LEAST_MARKS, Levels, ScreenMap, bars, field_along
@@ -20,10 +19,9 @@ from instrument.bench.bench import Bench
 from instrument.files.errors import duration
 from instrument.reconstruction.mosaic import in_colours
 from instrument.runs.run_control import RunControl
+from recon.arrays import Float32Array, Float64Array
 from recon.base.blocks import block_mean
 from recon.camera.registration import register
-
-Floats = npt.NDArray[np.float32]
 
 FINDING = "finding the screen"
 _BARS = (9, 16)  # rows, columns
@@ -46,7 +44,7 @@ class ScreenView:
     def __init__(self, bench: Bench, control: RunControl) -> None:
         self.slm = require_slm(bench)
         self._bench, self._control = bench, control
-        self._black: Floats | None = None
+        self._black: Float32Array | None = None
 
     def expose(self, levels: Levels, target: float) -> float:
         """Find the exposure at which levels are bright and nothing saturates, and photograph black with it.
@@ -74,7 +72,7 @@ class ScreenView:
         self._black = self.light(black)
         return found.exposure_ms
 
-    def light(self, levels: Levels) -> Floats:
+    def light(self, levels: Levels) -> Float32Array:
         """Show levels and return what comes of them, (height, width), counts."""
         self._control.check()
         self.slm.display(levels)
@@ -172,7 +170,7 @@ def find_screen(bench: Bench, control: RunControl, listener: Listener) -> Screen
     return found_map
 
 
-def _require_rest(first: Floats, last: Floats) -> None:
+def _require_rest(first: Float32Array, last: Float32Array) -> None:
     """Raise CalibrationError where the same mark lies elsewhere in the end: all marks are off then."""
     change = compare(last, first)
     moved_px = change.shift_px
@@ -188,7 +186,7 @@ def _require_rest(first: Floats, last: Floats) -> None:
         )
 
 
-def _centroid(photograph: Floats) -> npt.NDArray[np.float64]:
+def _centroid(photograph: Float32Array) -> Float64Array:
     """Return the (row, column) about which a pattern lies: what is brighter than a tenth of its brightest."""
     bright = np.maximum(photograph - 0.1 * np.quantile(photograph, 0.999), 0)
     rows, columns = (np.arange(n) for n in bright.shape)

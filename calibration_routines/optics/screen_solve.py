@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from calibration_routines.optics.screen_pictures import ScreenMap, ScreenTone
 from calibration_routines.options import MM, Checked
@@ -26,13 +25,12 @@ from instrument.files.slm_image import read_slm_levels
 from instrument.reconstruction.mosaic import in_colours
 from instrument.runs.run import Run
 from instrument.runs.run_control import RunControl
+from recon.arrays import Float32Array
 from recon.base.blocks import block_mean
 from recon.base.declare import RARE, option
 from recon.blind.known_pictures import PicturePsf, PictureSettings, psf_from_pictures, psf_work
 from recon.blind.left_out import POOR_DB, LeftOut, judged_by
 from recon.types import Calibration, Geometry
-
-Floats = npt.NDArray[np.float32]
 
 TONE, PICTURE, JUDGED, AGAIN = "tone", "picture", "judged", "tone again"
 """What the frames of such a run are called, besides dark ones (the screen shows black)."""
@@ -159,7 +157,7 @@ class _Frames:
                 assert step.slm_image is not None
                 shown.setdefault(step.slm_image, []).append(step.index)
 
-    def mean(self, frames: Sequence[int]) -> Floats:
+    def mean(self, frames: Sequence[int]) -> Float32Array:
         """Return the mean of some frames, (n_channels, height, width), black taken off, binned."""
         metadata = self.run.metadata(frames[0])
         light = np.mean([self.run.frame(n) for n in frames], axis=0, dtype=np.float32)
@@ -188,7 +186,7 @@ class _Frames:
         """Return the light of each photograph of a kind, counts a pixel."""
         return [float(self.mean(frames).mean()) for frames in self.of[label].values()]
 
-    def pairs(self, label: str, tone: ScreenTone) -> tuple[Floats, Floats]:
+    def pairs(self, label: str, tone: ScreenTone) -> tuple[Float32Array, Float32Array]:
         """Return photographs of a kind and the light that they show, (n, n_channels, height, width) both."""
         photographs = np.stack([self.mean(frames) for frames in self.of[label].values()])
         shape, binning = self.run.frame(0).shape[:2], self._record.asked.binning
@@ -214,7 +212,7 @@ class _Frames:
         )
 
 
-def moved_meanwhile(again: Floats, white: Floats, *, binning: int) -> tuple[str, ...]:
+def moved_meanwhile(again: Float32Array, white: Float32Array, *, binning: int) -> tuple[str, ...]:
     """Return in words how far white lies elsewhere in the end; nothing where noise hides its structure.
 
     Parameters

@@ -14,7 +14,6 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
-import numpy.typing as npt
 from scipy import ndimage
 
 from calibration_routines.options import MM, Checked
@@ -36,13 +35,13 @@ from instrument.runs.acquire import abilities_of
 from instrument.runs.results import STAGE_FILE
 from instrument.runs.run import Run
 from instrument.runs.run_control import RunControl
+from recon.arrays import Float32Array
 from recon.base.blocks import block_mean
 from recon.base.declare import RARE, option
 from recon.camera.registration import moved
 from recon.types import Geometry
 
-Float = npt.NDArray[np.float32]
-Floats = npt.NDArray[np.float64]
+Float = Float32Array
 
 _AXES = ("x_um", "y_um", "z_um")
 _TURN = ("up", "above", "down", "below")

@@ -27,11 +27,12 @@ from calibration_routines.psf.sweep_plan import DARK, FEATURE_PX, PSF, REFERENCE
 from calibration_routines.scatter import STEADY, TOLERATED, Scatter, Steadied, pooled, steadied
 from instrument.files.errors import count
 from instrument.runs.run import Run
+from recon.arrays import BoolArray, Float32Array
 from recon.base.blocks import block_mean
 from recon.types import Geometry
 
 Counts = npt.NDArray[np.uint8] | npt.NDArray[np.uint16]
-Float = npt.NDArray[np.float32]
+Float = Float32Array
 
 _NOISE_PX = 250_000
 _LONE = 6.0  # times the median around it: a Gaussian spot of 1.1 pixels in the middle of one is six times
@@ -111,7 +112,7 @@ class DarkModel:
             more = float(np.median(_mean(stack[first:]) - _mean(stack[:first])))
             self.brightening_per_ms = more / self._exposures_ms[longest]
 
-    def lone(self, image: Float) -> npt.NDArray[np.bool_]:
+    def lone(self, image: Float) -> BoolArray:
         """Return which pixels of an image of light, (height, width[, 3]), counts, stand alone.
 
         Brighter by far than noise, than a hundredth of full scale, and :data:`_LONE` times as bright as the
@@ -123,7 +124,7 @@ class DarkModel:
         beyond = image - median
         noise = 1.4826 * float(np.median(np.abs(beyond - np.median(beyond))))
         least = np.maximum(_FAR * np.maximum(noise, np.sqrt(median + 1.0)), 0.01 * self._full_scale)
-        found: npt.NDArray[np.bool_] = (beyond > least) & (image > _LONE * median)
+        found: BoolArray = (beyond > least) & (image > _LONE * median)
         return found
 
     def at(self, exposure_ms: float) -> Float:
@@ -289,12 +290,12 @@ def plane_light(plane: PlaneFrames, dark: DarkModel) -> Steadied:
     return light_frames(plane.frames, dark_frame, dark.hot)
 
 
-def light_frames(frames: Counts, dark_frame: Float, hot: npt.NDArray[np.bool_]) -> Steadied:
+def light_frames(frames: Counts, dark_frame: Float, hot: BoolArray) -> Steadied:
     """Return frames of the same thing, (n_frames, height, width[, 3]) without dark frame and hot pixels."""
     return steadied(np.stack([replace_hot(frame - dark_frame, hot) for frame in frames]))
 
 
-def replace_hot(image: Float, hot: npt.NDArray[np.bool_]) -> Float:
+def replace_hot(image: Float, hot: BoolArray) -> Float:
     """Replace hot pixels by the median of the 3 x 3 pixels around them.
 
     Image and mask are (height, width) or (height, width, 3).

@@ -25,6 +25,7 @@ from drivers.camera import Camera
 from drivers.frame import Frame
 from drivers.led_array import LedPattern
 from instrument.bench.bench import Bench
+from recon.arrays import BoolArray
 
 Counts = npt.NDArray[np.uint8] | npt.NDArray[np.uint16]
 TARGET = 0.7
@@ -134,7 +135,7 @@ class AutoExposure:
         return f"Auto-exposure {self.outcome.value}: {found}.{advice}"
 
 
-def hot_pixels(dark: Counts, full_scale: int) -> npt.NDArray[np.bool_]:
+def hot_pixels(dark: Counts, full_scale: int) -> BoolArray:
     """Find the pixels that are bright without light.
 
     A pixel is hot when it stands above the dark frame's median by more than 8 standard deviations of its
@@ -151,7 +152,7 @@ def auto_expose(
     camera: Camera,
     *,
     target: float = TARGET,
-    hot: npt.NDArray[np.bool_] | None = None,
+    hot: BoolArray | None = None,
 ) -> AutoExposure:
     """Set the camera's exposure for a PSF: bright, as ``target`` says, and nothing saturated.
 
@@ -222,9 +223,7 @@ def auto_expose(
         exposure = camera.set_exposure_ms(float(np.clip(wanted, shortest, longest)))
 
 
-def measure_exposure(
-    frame: Frame, exposure_ms: float, hot: npt.NDArray[np.bool_] | None = None
-) -> ExposureTrial:
+def measure_exposure(frame: Frame, exposure_ms: float, hot: BoolArray | None = None) -> ExposureTrial:
     """Judge a frame: its :data:`PERCENTILE`, brightest pixel and saturated pixels, hot ones excepted.
 
     Raises ValueError when ``hot`` does not have the frame's shape.

@@ -9,9 +9,10 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 import numpy as np
-import numpy.typing as npt
 
-Float = npt.NDArray[np.float32]
+from recon.arrays import Float32Array
+
+Float = Float32Array
 
 _PIXELS = 250_000  # enough of them tell a variance
 _BRIGHT = 0.9  # quantile above which a pixel's light is looked at

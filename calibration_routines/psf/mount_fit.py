@@ -19,6 +19,7 @@ from scipy.special import stdtrit
 from calibration_routines.psf.psf_quality import MAX_CLIPPED, PsfQuality
 from calibration_routines.psf.stage_fit import StageFit
 from calibration_routines.scatter import compare, growth, reduction
+from recon.arrays import Float64Array
 from recon.base.blocks import block_mean
 from recon.camera.depth_mixture import paraxial_scale
 from recon.camera.registration import moved, rescaled
@@ -140,7 +141,7 @@ def fit_mount(
     logs = np.log(np.asarray(light, np.float64)[kept])
     scale = z.min()
 
-    def off(p: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+    def off(p: Float64Array) -> Float64Array:
         return np.asarray(logs - p[0] + 2 * np.log(np.maximum(z + scale * p[1], 0.05 * z)))
 
     start = np.array([float(np.mean(logs + 2 * np.log(z))), 0.0])
@@ -190,7 +191,7 @@ def fit_mount(
     return MountFit(farther, error, beside, beside_error, uneven, distance, tuple(found))
 
 
-def _bent(planes: Sequence[PsfQuality], z: npt.NDArray[np.float64], geometry: Geometry) -> float:
+def _bent(planes: Sequence[PsfQuality], z: Float64Array, geometry: Geometry) -> float:
     """Return by which share a pattern grows less than its rays move apart, because the diffuser bends them.
 
     A ray from ``xi`` moves with ``xi``, but lies where it was bent to: growth about the place where light
@@ -207,7 +208,7 @@ def _bent(planes: Sequence[PsfQuality], z: npt.NDArray[np.float64], geometry: Ge
 
 def _distance(
     psfs: Sequence[npt.NDArray[np.floating]],
-    z: npt.NDArray[np.float64],
+    z: Float64Array,
     d_um: float,
     bent: float,
     unsure: float,
@@ -261,7 +262,7 @@ def _distance(
 
 
 def _beside(
-    planes: Sequence[PsfQuality], z: npt.NDArray[np.float64], geometry: Geometry
+    planes: Sequence[PsfQuality], z: Float64Array, geometry: Geometry
 ) -> tuple[tuple[float, float] | None, float, float]:
     """Return the source's place across, its error, and how far that moves the centroid, pixels."""
     d_mm, pitch_um = geometry.diffuser_distance_mm, geometry.pixel_pitch_um

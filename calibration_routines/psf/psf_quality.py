@@ -18,12 +18,13 @@ import numpy as np
 import numpy.typing as npt
 from scipy.fft import dctn, idctn
 
+from recon.arrays import BoolArray, Float32Array
 from recon.base.blocks import block_mean
 
 
 def remove_low_frequencies(
     image: npt.NDArray[np.floating], order: int = 10
-) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.float32]]:
+) -> tuple[Float32Array, Float32Array]:
     """Set the ``order x order`` lowest DCT coefficients to zero, then negative values to zero.
 
     The dissertation's microscope does so with ``order=10`` against autofluorescence and unfiltered excitation
@@ -269,7 +270,7 @@ def temporal_noise(frames: npt.NDArray[np.floating] | npt.NDArray[np.unsignedint
     return float(np.sqrt(values[:, bright].var(axis=0, ddof=1).mean() / len(values)))
 
 
-def _support(coarse: npt.NDArray[np.float32]) -> npt.NDArray[np.bool_]:
+def _support(coarse: Float32Array) -> BoolArray:
     """Blocks with light: above a sixth of the pattern's own mean level and above the noise between blocks."""
     positive = np.maximum(coarse, 0.0)
     if not positive.any():
@@ -278,7 +279,7 @@ def _support(coarse: npt.NDArray[np.float32]) -> npt.NDArray[np.bool_]:
     median = float(np.median(coarse))
     dark_side = coarse[coarse <= median]
     noise = 1.4826 * float(np.median(np.abs(dark_side - np.median(dark_side))))
-    support: npt.NDArray[np.bool_] = coarse > max(typical / 6.0, 10.0 * noise)
+    support: BoolArray = coarse > max(typical / 6.0, 10.0 * noise)
     return support
 
 

@@ -13,12 +13,12 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from drivers.stage import OVER
 from instrument.bench.bench import Bench
 from instrument.files.errors import BenchError, SettingsError
 from recon.analysis.resolution import SPECTRUM_LEVEL, axial_spacing_per_um, lateral_spacing_um
+from recon.arrays import Float64Array
 from recon.optics.fall_off import FallOff
 from recon.types import Geometry
 
@@ -61,7 +61,7 @@ def lateral_spacing(response: FallOff | None, z_um: float, *, along: str = "x") 
             "sensor is known",
         )
 
-    def along_axis(angles: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+    def along_axis(angles: Float64Array) -> Float64Array:
         tangents, zero = np.tan(angles), np.zeros_like(angles)
         return response(zero, tangents) if along == "x" else response(tangents, zero)
 

@@ -17,7 +17,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-import numpy.typing as npt
 
 from calibration_routines.psf.psf_quality import (
     MAX_STEP_PX,
@@ -35,12 +34,12 @@ from calibration_routines.scatter import (
     growth,
     reduction,
 )
+from recon.arrays import Float32Array, Float64Array
 from recon.base.blocks import block_mean
 from recon.camera.registration import Registration, moved, register
 from recon.types import Geometry
 
-Float = npt.NDArray[np.float32]
-Floats = npt.NDArray[np.float64]
+Float = Float32Array
 
 MAX_BRIGHTNESS_DRIFT = 0.1
 """Change of the source's light between two visits beyond which a straight line is not to be relied on."""
@@ -256,7 +255,7 @@ class StageFit:
 
 
 def judge_points(
-    quality: Sequence[PsfQuality], psfs: npt.NDArray[np.float32], geometry: Geometry
+    quality: Sequence[PsfQuality], psfs: Float32Array, geometry: Geometry
 ) -> tuple[tuple[PsfQuality, ...], tuple[StageFit, ...]]:
     """Judge the PSFs of a sweep against one another.
 
@@ -292,8 +291,8 @@ def judge_points(
 
 
 def fit_stage(
-    places_um: Floats, shifts_px: Floats, nominal_px_per_um: float | None
-) -> tuple[Floats, float | None, float, float]:
+    places_um: Float64Array, shifts_px: Float64Array, nominal_px_per_um: float | None
+) -> tuple[Float64Array, float | None, float, float]:
     """Fit ``shift = -G (place)`` robustly, with the central point fixed at zero.
 
     Parameters
@@ -313,7 +312,7 @@ def fit_stage(
     """
     offset = len(places_um) >= _LEAST_POINTS  # the central registration's own error, where it can be told
 
-    def missed(p: Floats) -> Floats:
+    def missed(p: Float64Array) -> Float64Array:
         model = -(places_um @ p[:4].reshape(2, 2).T) + (p[4:] if offset else 0.0)
         return np.asarray((shifts_px - model).ravel())
 
@@ -335,8 +334,8 @@ def fit_stage(
 
 
 def _fit_line(
-    places_um: Floats, shifts_px: Floats, nominal_px_per_um: float | None
-) -> tuple[Floats, float | None, float]:
+    places_um: Float64Array, shifts_px: Float64Array, nominal_px_per_um: float | None
+) -> tuple[Float64Array, float | None, float]:
     """Fit one turn and one scale robustly: the median over the points; returned as by :func:`fit_stage`."""
     place, shift = (v[:, 1] + 1j * v[:, 0] for v in (places_um, shifts_px))
     ratios = -shift / place
@@ -347,7 +346,7 @@ def _fit_line(
 
 def _judge_depth(
     judged: list[PsfQuality],
-    psfs: npt.NDArray[np.float32],
+    psfs: Float32Array,
     geometry: Geometry,
     centre: int,
     others: list[int],
@@ -381,8 +380,8 @@ def _held_against_stage(
     judged: list[PsfQuality],
     z_um: float,
     seen: list[int],
-    places: Floats,
-    shifts: Floats,
+    places: Float64Array,
+    shifts: Float64Array,
     nominal: float | None,
 ) -> StageFit:
     spans = len(seen) >= 2 and np.linalg.matrix_rank(places, tol=1e-6 * np.abs(places).max()) == 2
@@ -427,7 +426,7 @@ def _held_against_stage(
     )
 
 
-def _gain_error_std(residuals_px: Floats, places_um: Floats, nominal: float | None) -> float:
+def _gain_error_std(residuals_px: Float64Array, places_um: Float64Array, nominal: float | None) -> float:
     if nominal is None:
         return 0.0
     a_coordinate_px = max(float(np.sqrt(np.mean(residuals_px**2) / 2)), _LEAST_RESIDUAL_PX)
@@ -435,9 +434,9 @@ def _gain_error_std(residuals_px: Floats, places_um: Floats, nominal: float | No
 
 
 def find_pattern(
-    psf: npt.NDArray[np.float32],
-    reference: npt.NDArray[np.float32],
-    place_um: Floats,
+    psf: Float32Array,
+    reference: Float32Array,
+    place_um: Float64Array,
     nominal_px_per_um: float | None,
     factor: int,
 ) -> Registration | None:

@@ -14,7 +14,6 @@ from dataclasses import dataclass, replace
 from typing import cast
 
 import numpy as np
-import numpy.typing as npt
 
 from calibration_routines.psf.analysis import (
     Counts,
@@ -45,11 +44,11 @@ from calibration_routines.psf.sweep_plan import DARK, REFERENCE
 from calibration_routines.scatter import NO_CHANGE, TOLERATED, Change, Steadied, compare, reduction
 from instrument.bench.photograph import Snapshot
 from instrument.plan import Step
+from recon.arrays import BoolArray, Float32Array
 from recon.base.blocks import block_mean
 from recon.types import Geometry
 
-Float = npt.NDArray[np.float32]
-Mask = npt.NDArray[np.bool_]
+Float = Float32Array
 
 _SATURATED_DIMMING = 0.7  # a PSF that saturated is taken again with this part of its exposure
 _SLACK = MAX_GAIN_ERROR + 1e-3 * MAX_ROTATION_MRAD  # of a shift: what a wrong d or a turned camera may do
@@ -121,8 +120,8 @@ class SweepWatch:
         self._planes: list[PsfQuality] = []  # good central PSFs, one a depth
         self._first_visit: tuple[Position, Float] | None = None
         self._first_light = np.empty((0, 0), np.float32)  # of all its pixels
-        self._alone: list[tuple[Position, Mask]] = []  # what stood alone at the newest places
-        self._late_hot: Mask | None = None
+        self._alone: list[tuple[Position, BoolArray]] = []  # what stood alone at the newest places
+        self._late_hot: BoolArray | None = None
         self._visits: list[SourceVisit] = []
         self._change: Change = NO_CHANGE  # of the newest visit against the first
         self._points_done = 0
@@ -274,7 +273,7 @@ class SweepWatch:
         self._visits.append(visit)
         self._report(visit)
 
-    def _turned(self, now: Float, first: Float, full_scale: int) -> Mask:
+    def _turned(self, now: Float, first: Float, full_scale: int) -> BoolArray:
         """Return the pixels that turned hot, or are no longer, since the first visit, at the same place.
 
         Those that stand alone in one of two pictures of the same pattern. One that moved has left its own

@@ -22,6 +22,7 @@ from drivers.simulated.faults import disturbed, disturbs
 from drivers.simulated.look import Look
 from drivers.simulated.wire import Pulse
 from drivers.simulated.world import Rgb, SimulatedWorld
+from recon.arrays import Float32Array
 from recon.optics.sensor import FixedPattern, Readout, expose
 
 Pixels = npt.NDArray[np.uint8] | npt.NDArray[np.uint16]
@@ -74,12 +75,12 @@ class SimulatedCamera(SimulatedCameraSettings):
         self._next_id = 0
         self._lost = 0
         self._failure: DeviceError | None = None
-        self._light: tuple[Any, npt.NDArray[np.float32]] | None = None
+        self._light: tuple[Any, Float32Array] | None = None
         self._looks: list[Look] = []
         self._asked_s = 0.0
         self._coarse: tuple[Pixels, int] | None = None
         self._pattern: tuple[Any, FixedPattern] | None = None
-        self._replay: tuple[npt.NDArray[np.float32], Any, list[tuple[Pixels, float]]] | None = None
+        self._replay: tuple[Float32Array, Any, list[tuple[Pixels, float]]] | None = None
 
     def open(self) -> None:
         """Connect, with the camera's own default settings."""
@@ -279,7 +280,7 @@ class SimulatedCamera(SimulatedCameraSettings):
             if self._abort.is_set() or self._producer is None:
                 return
 
-    def _light_during(self, pulse: Pulse, exposure_ms: float) -> npt.NDArray[np.float32]:
+    def _light_during(self, pulse: Pulse, exposure_ms: float) -> Float32Array:
         """Return the mean light of an exposure, which what is shown may change during."""
         total = np.zeros(self.image_shape, np.float32)
         for share, show in pulse.during(1e-3 * exposure_ms):
@@ -323,7 +324,7 @@ class SimulatedCamera(SimulatedCameraSettings):
         )
 
     def _read_out(
-        self, light: npt.NDArray[np.float32], exposure_ms: float, gain: float, frame_id: int
+        self, light: Float32Array, exposure_ms: float, gain: float, frame_id: int
     ) -> tuple[Pixels, float]:
         """Return the counts of an exposure and the fraction of them at full scale."""
         if self.options.replay_frames == 0:
@@ -337,7 +338,7 @@ class SimulatedCamera(SimulatedCameraSettings):
         return self._replay[2][frame_id % self.options.replay_frames]
 
     def _render(
-        self, light: npt.NDArray[np.float32], exposure_ms: float, gain: float, frame_id: int
+        self, light: Float32Array, exposure_ms: float, gain: float, frame_id: int
     ) -> tuple[Pixels, float]:
         area = self._binning**2
         readout = Readout(
@@ -373,7 +374,7 @@ class SimulatedCamera(SimulatedCameraSettings):
         height, width = self.image_shape
         return slice(top, top + height), slice(left, left + width)
 
-    def _electrons_per_s(self) -> npt.NDArray[np.float32]:
+    def _electrons_per_s(self) -> Float32Array:
         """Photons absorbed a second by each pixel of the region, through the colour filters."""
         key = (self.world.light_key(), self._roi, self._binning)
         if self._light is not None and self._light[0] == key:
@@ -419,8 +420,8 @@ class SimulatedCamera(SimulatedCameraSettings):
         self,
         region: tuple[slice, slice],
         binning: int,
-        filters: list[tuple[Rgb, npt.NDArray[np.float32] | None]],
-    ) -> npt.NDArray[np.float32]:
+        filters: list[tuple[Rgb, Float32Array | None]],
+    ) -> Float32Array:
         """Return the light of a region; coarsely first where somebody wants to see that."""
         self._coarse = coarse = self._coarsely(region, binning) if self.coarse_first else None
         try:
@@ -433,8 +434,8 @@ class SimulatedCamera(SimulatedCameraSettings):
         self,
         region: tuple[slice, slice],
         binning: int,
-        filters: list[tuple[Rgb, npt.NDArray[np.float32] | None]],
-    ) -> npt.NDArray[np.float32]:
+        filters: list[tuple[Rgb, Float32Array | None]],
+    ) -> Float32Array:
         rows, columns = region
         total = np.zeros((rows.stop - rows.start, columns.stop - columns.start), np.float32)
         for sensitivity, mosaic in filters:
@@ -443,12 +444,12 @@ class SimulatedCamera(SimulatedCameraSettings):
                 total += light[rows, columns] if mosaic is None else light[rows, columns] * mosaic
         return total
 
-    def _filters(self) -> list[tuple[Rgb, npt.NDArray[np.float32] | None]]:
+    def _filters(self) -> list[tuple[Rgb, Float32Array | None]]:
         """Sensitivity to the three bands of each kind of pixel, and where those are (None: everywhere)."""
         efficiency = self._spec.quantum_efficiency
         if not self.options.color:
             return [(efficiency, None)]
-        filters: list[tuple[Rgb, npt.NDArray[np.float32] | None]] = []
+        filters: list[tuple[Rgb, Float32Array | None]] = []
         height, width = self.image_shape
         for color, places in enumerate((((0, 0),), ((0, 1), (1, 0)), ((1, 1),))):
             red, green, blue = (

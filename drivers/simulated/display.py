@@ -8,7 +8,6 @@ from math import pi
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 from pydantic import Field
 
 from drivers.common.stage_axes import AXIS_NAMES
@@ -20,11 +19,10 @@ from drivers.simulated.mechanics import AxisSpec
 from drivers.simulated.slm import SimulatedSlm, SlmOptions
 from drivers.simulated.stage import AxisOptions, CarriageStage, StageOptions, axis_spec
 from drivers.simulated.surroundings import CommonOptions, Surroundings
+from recon.arrays import Float32Array
 from recon.base.blocks import block_sum
 from recon.optics.scattering_display import DisplaySpec, MaskPose, ScatteringDisplay
 from recon.optics.sensor import SensorSpec
-
-Image = npt.NDArray[np.float32]
 
 SENSOR = SensorSpec(
     name="display camera",
@@ -140,8 +138,8 @@ class DisplayWorld(Surroundings):
         self._slm_pitch_um = 8.0
         self._optics: dict[float, ScatteringDisplay] = {}
         self._lasers: tuple[tuple[float, float], ...] = ()
-        self._flatness: npt.NDArray[np.float32] | None = None
-        self._image: tuple[Any, Image] | None = None
+        self._flatness: Float32Array | None = None
+        self._image: tuple[Any, Float32Array] | None = None
 
     # What the devices do to the world ---
     def mount_slm(self, slm: DisplaySlm) -> None:
@@ -171,7 +169,7 @@ class DisplayWorld(Surroundings):
             options.yaw_mrad + stage.get("yaw_mrad", 0.0),
         )
 
-    def photons_per_s(self, weights: tuple[float, float, float], binning: int = 1) -> Image | None:
+    def photons_per_s(self, weights: tuple[float, float, float], binning: int = 1) -> Float32Array | None:
         """Return electrons a second on every binned camera pixel now, or None when all lasers are off."""
         if not self._shining or self._slm is None:
             return None
@@ -191,7 +189,7 @@ class DisplayWorld(Surroundings):
         own = ((self.options.wavelength_nm, 1.0),) if self.scene_lit else ()
         return own + self._lasers
 
-    def _seen(self, slm: DisplaySlm, wavelength_nm: float) -> Image:
+    def _seen(self, slm: DisplaySlm, wavelength_nm: float) -> Float32Array:
         """Return the light of one laser, 1 in the mean of the field without losses."""
         # The same optical path at every wavelength; glass and liquid crystal without dispersion.
         turns = self.options.wavelength_nm / wavelength_nm
@@ -199,7 +197,7 @@ class DisplayWorld(Surroundings):
         optics = self._scattering_display(phase.shape, wavelength_nm)
         return optics.irradiance((phase + self._flatness_map(phase.shape)) * turns, self.pose(), amplitude)
 
-    def _modulation(self, slm: DisplaySlm) -> tuple[Image, Image]:
+    def _modulation(self, slm: DisplaySlm) -> tuple[Float32Array, Float32Array]:
         """Return the phase that light gains at each pixel, and the part of its amplitude that returns."""
         if self.options.mirrors:
             return np.zeros(slm.shape, np.float32), (slm.displayed / 255).astype(np.float32)
@@ -234,7 +232,7 @@ class DisplayWorld(Surroundings):
             self._optics[wavelength_nm] = ScatteringDisplay(spec, phase * turns)
         return self._optics[wavelength_nm]
 
-    def _flatness_map(self, shape: tuple[int, ...]) -> npt.NDArray[np.float32]:
+    def _flatness_map(self, shape: tuple[int, ...]) -> Float32Array:
         """Return a smooth phase error of the SLM: random polynomials up to third order, radians."""
         if self._flatness is None:
             rng = np.random.default_rng(self.options.seed + 3)

@@ -11,13 +11,11 @@ from dataclasses import replace
 
 import cv2
 import numpy as np
-import numpy.typing as npt
 from pydantic import Field
 
 from drivers.device import DriverOptions
+from recon.arrays import Float32Array
 from recon.optics.sensor import FixedPattern
-
-Image = npt.NDArray[np.float32]
 
 _LEAST_LIGHT = 0.02
 """Of its usual brightness: a lamp does not flicker to less."""
@@ -56,7 +54,9 @@ class FaultOptions(DriverOptions):
     late_hot_after_s: float = Field(2.0, ge=0, description="Simulated seconds until then.")
 
 
-def disturbed(light: Image, faults: FaultOptions, frame: tuple[int, int], at_s: float, binning: int) -> Image:
+def disturbed(
+    light: Float32Array, faults: FaultOptions, frame: tuple[int, int], at_s: float, binning: int
+) -> Float32Array:
     """Return what falls on the pixels in a frame, given what would fall on them without faults.
 
     Parameters

@@ -18,13 +18,11 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
 import numpy as np
-import numpy.typing as npt
 
 import recon.optics
 from drivers.common.cache import cache_folder
+from recon.arrays import Float32Array, Float64Array
 from recon.optics.scene import Scene
-
-Image = npt.NDArray[np.float32]
 
 WORTH_PIXELS = 1_000_000
 """Light on fewer is computed in less than a second."""
@@ -47,7 +45,7 @@ def name_of(scene: Scene, *circumstances: object) -> str:
     return digest.hexdigest()
 
 
-def _content(scene: Scene) -> Iterator[tuple[npt.NDArray[np.float32] | npt.NDArray[np.float64], object]]:
+def _content(scene: Scene) -> Iterator[tuple[Float32Array | Float64Array, object]]:
     for layer in scene.layers:
         yield layer.radiance, (layer.z_um, layer.size_um, layer.center_um)
     for beads in scene.beads:
@@ -75,7 +73,7 @@ def is_kept(name: str) -> bool:
     return _file(name).exists()
 
 
-def kept(name: str) -> Image | None:
+def kept(name: str) -> Float32Array | None:
     """Return the light that was kept by a name."""
     path = _file(name)
     with suppress(OSError, ValueError, KeyError, zipfile.BadZipFile):
@@ -86,7 +84,7 @@ def kept(name: str) -> Image | None:
     return None
 
 
-def keep(name: str, light: Image) -> None:
+def keep(name: str, light: Float32Array) -> None:
     """Keep light by a name, where there is room and a folder that may be written to."""
     path = _file(name)
     part = path.with_suffix(f".{os.getpid()}.part")

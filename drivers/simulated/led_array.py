@@ -8,7 +8,6 @@ from functools import partial
 from typing import ClassVar
 
 import numpy as np
-import numpy.typing as npt
 from pydantic import Field
 
 from drivers.device import DriverOptions, Setting, SharedPart
@@ -19,6 +18,7 @@ from drivers.simulated.scene_light import Lamp, SceneLight
 from drivers.simulated.surroundings import SimulatedDevice, Surroundings
 from drivers.simulated.wire import LED_LINE
 from drivers.simulated.world import SimulatedWorld
+from recon.arrays import Float64Array
 from recon.optics.grid import BANDS
 
 
@@ -77,12 +77,12 @@ class SimulatedLedArray(SimulatedDevice, LedArray):
         }
 
     @property
-    def led_positions_mm(self) -> npt.NDArray[np.float64]:
+    def led_positions_mm(self) -> Float64Array:
         """``(n_leds, 3)`` positions, millimetres."""
         return self._positions_mm.copy()
 
     @property
-    def led_na(self) -> npt.NDArray[np.float64]:
+    def led_na(self) -> Float64Array:
         """``(n_leds, 2)`` sines of the illumination angle in x and y."""
         across = self._positions_mm[:, :2]
         distance = np.sqrt((across**2).sum(axis=1) + self.options.distance_mm**2)
@@ -180,7 +180,7 @@ class SimulatedLedArray(SimulatedDevice, LedArray):
         self.world.set_emission((red, green, blue))
 
 
-def _round_array(count: int, pitch_mm: float) -> npt.NDArray[np.float64]:
+def _round_array(count: int, pitch_mm: float) -> Float64Array:
     """Return the ``count`` places of a square grid nearest to its middle, from the middle outwards."""
     reach = int(np.ceil(np.sqrt(count)))
     axis = np.arange(-reach, reach + 1)

@@ -15,26 +15,25 @@ from drivers.led_array import LedPattern
 from drivers.simulated.camera import SimulatedCamera
 from drivers.simulated.led_array import LedArrayOptions, SimulatedLedArray
 from drivers.simulated.surroundings import CommonOptions, Surroundings
+from recon.arrays import Float32Array, Float64Array
 from recon.base.blocks import block_sum
 from recon.optics.diffuser import Diffuser, microlens_diffuser, smooth_diffuser
 from recon.optics.grid import BANDS
 from recon.optics.sensor import SensorSpec
 from recon.types import Geometry
 
-Floats = npt.NDArray[np.float64]
-
 
 def led_image(
     phase: npt.NDArray[np.floating],
     pitch_um: float,
-    sines: Floats,
-    weights: Floats,
+    sines: Float64Array,
+    weights: Float64Array,
     *,
     wavelength_nm: float,
     na: float,
     defocus_um: float = 0.0,
     workers: int = 2,
-) -> npt.NDArray[np.float32]:
+) -> Float32Array:
     """Image of a thin phase sample, relative to no sample and all the LEDs' light through the pupil.
 
     Partially coherent imaging, wave by wave: every LED is a point far away and incoherent with the others. It
@@ -80,7 +79,6 @@ def led_image(
     return total
 
 
-Image = npt.NDArray[np.float32]
 Rgb = tuple[float, float, float]
 RIM_UM = 80.0
 """Of the sample beyond the field of view on each side: what the propagation wraps around stays out of it."""
@@ -132,7 +130,7 @@ class LedMicroscopeWorld(Surroundings):
         self._sines = np.zeros((0, 2))
         self._levels = np.zeros((0, 3))
         self._sample: Diffuser | None = None
-        self._images: dict[bytes, Image] = {}
+        self._images: dict[bytes, Float32Array] = {}
 
     @property
     def geometry(self) -> Geometry:
@@ -169,15 +167,15 @@ class LedMicroscopeWorld(Surroundings):
                     )
             return self._sample
 
-    def true_height_um(self) -> Image:
+    def true_height_um(self) -> Float32Array:
         """Return the diffuser's surface in the camera's field of view, ``(pixels, pixels)`` float32."""
         return self.sample.heights_um[self._view]
 
-    def light_leds(self, sines: npt.NDArray[np.float64], levels: npt.NDArray[np.float64]) -> None:
+    def light_leds(self, sines: Float64Array, levels: Float64Array) -> None:
         """Light LEDs: ``(n, 2)`` sines of their directions, ``(n, 3)`` levels of each band, 0 to 1."""
         self._sines, self._levels = sines, levels
 
-    def photons_per_s(self, weights: Rgb, binning: int = 1) -> Image | None:
+    def photons_per_s(self, weights: Rgb, binning: int = 1) -> Float32Array | None:
         """Electrons a second on every binned camera pixel now, or None when all LEDs are dark."""
         sines, levels = self._sines, self._levels
         if not (levels * np.array(weights)).any():
@@ -191,7 +189,7 @@ class LedMicroscopeWorld(Surroundings):
             image = self._images[key]
         return image if binning == 1 else block_sum(image, binning)
 
-    def _render(self, sines: npt.NDArray[np.float64], levels: npt.NDArray[np.float64], weights: Rgb) -> Image:
+    def _render(self, sines: Float64Array, levels: Float64Array, weights: Rgb) -> Float32Array:
         sample, total = self.sample, np.zeros((self.options.pixels, self.options.pixels), np.float32)
         for band, (line, weight) in enumerate(zip(BANDS, weights, strict=True)):
             lit = levels[:, band] > 0

@@ -6,9 +6,9 @@ from functools import cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
-import numpy.typing as npt
 
 from drivers.errors import DeviceError
+from recon.arrays import Float32Array
 from recon.optics.animal import Animal
 from recon.optics.grid import FloatArray, mixed_spectrum
 from recon.optics.near_psfs import NearPsfs
@@ -16,7 +16,6 @@ from recon.optics.near_psfs import NearPsfs
 if TYPE_CHECKING:
     from drivers.simulated.world import Rgb, SimulatedWorld
 
-Image = npt.NDArray[np.float32]
 
 POWER = 6e-4
 """Of a cell at rest, relative to a bead."""
@@ -58,7 +57,7 @@ class LivingLight:
             )
 
     @cached_property
-    def _parts(self) -> tuple[Image, Image, Image]:
+    def _parts(self) -> tuple[Float32Array, Float32Array, Float32Array]:
         """Pictures of each cell at rest, of all tissue, and of a blood cell at each place of the vessel."""
         world, animal = self._world, self.animal
         nodes: list[FloatArray] = [
@@ -68,7 +67,7 @@ class LivingLight:
         psf = NearPsfs(world.propagator, world.fall_off, self._grid, spectrum, nodes, animal.diameter_um)
         photons = POWER * world.preset.bead_photons_per_s_sr
 
-        def of(places: FloatArray) -> Image:
+        def of(places: FloatArray) -> Float32Array:
             return np.stack([psf((float(x), float(y), float(z))) for x, y, z in places])
 
         cells = of(animal.cells_um)
@@ -80,16 +79,16 @@ class LivingLight:
         return cells, np.float32(photons) * tissue, blood
 
     @cached_property
-    def _stray(self) -> Image:
+    def _stray(self) -> Float32Array:
         cells, tissue, _ = self._parts
         level = STRAY * float((cells.sum(axis=0) + tissue).mean())
         height, width = self._grid.shape
         y, x = np.linspace(-1, 1, height)[:, None], np.linspace(-1, 1, width)
         shape = 1 + 0.35 * x + 0.2 * y + 0.5 * (x**2 + y**2)
-        stray: Image = (level * shape / shape.mean()).astype(np.float32)
+        stray: Float32Array = (level * shape / shape.mean()).astype(np.float32)
         return stray
 
-    def at(self, time_s: float) -> Image:
+    def at(self, time_s: float) -> Float32Array:
         """Return photons a second on each pixel."""
         from scipy import ndimage
 
@@ -105,5 +104,5 @@ class LivingLight:
         moved = -np.array([y, x]) * self._world.distance_um / z_um / self._grid.pitch_um
         light = ndimage.shift(light, moved, order=3, mode="nearest", prefilter=True)
         np.maximum(light, 0, out=light)
-        seen: Image = light + self._stray
+        seen: Float32Array = light + self._stray
         return seen

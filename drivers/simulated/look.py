@@ -7,8 +7,7 @@ import threading
 from collections.abc import Callable
 from pathlib import Path
 
-import numpy as np
-import numpy.typing as npt
+from recon.arrays import Float32Array
 
 _COMPUTING = ("render", "recon")
 """How names begin of threads that light is shared among: the renderer's own, and the pool for blocks."""
@@ -32,9 +31,9 @@ class Look:
         Returns the light.
     """
 
-    def __init__(self, see: Callable[[], npt.NDArray[np.float32]]) -> None:
+    def __init__(self, see: Callable[[], Float32Array]) -> None:
         self._see = see
-        self._seen: npt.NDArray[np.float32] | None = None
+        self._seen: Float32Array | None = None
         self._error: Exception | None = None
         self._over = threading.Event()
         self._spent_s: dict[threading.Thread, float] = {}
@@ -71,7 +70,7 @@ class Look:
         """Let go of who waits; what is being computed is kept by the world."""
         self._over.set()
 
-    def light(self) -> npt.NDArray[np.float32] | None:
+    def light(self) -> Float32Array | None:
         """Wait for the light, or raise what kept it from being computed; None: it was given up."""
         self._over.wait()
         if self._error is not None:

@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import numpy.typing as npt
 
+from recon.arrays import Float32Array
 from recon.optics.scene import Beads, Layer, Scene
 
 
@@ -46,7 +47,7 @@ class SceneLight:
         """Whether every lamp is as bright in all bands."""
         return all(len(set(lamp.rgb)) == 1 for lamp in self.lamps)
 
-    def at(self, x_um: npt.ArrayLike, y_um: npt.ArrayLike) -> npt.NDArray[np.float32]:
+    def at(self, x_um: npt.ArrayLike, y_um: npt.ArrayLike) -> Float32Array:
         """Return the light on places across the axis, (..., 3), relative to one LED right opposite.
 
         Of each LED the cosine fourth of the angle: inverse square, and the tilt at both ends.
@@ -71,6 +72,6 @@ class SceneLight:
         )
         return Scene(scene.name, layers, beads)
 
-    def _on_layer(self, layer: Layer) -> npt.NDArray[np.float32]:
+    def _on_layer(self, layer: Layer) -> Float32Array:
         x, y = ((edges[:-1] + edges[1:]) / 2 for edges in (layer.x_edges_um, layer.y_edges_um))
         return self.at(x[None, :], y[:, None])

@@ -7,9 +7,9 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-import numpy.typing as npt
 
 from drivers.simulated.options import Preset, WorldOptions
+from recon.arrays import Float32Array
 from recon.optics.scene import Scene, bar_target, bead_volume, picture, tilted_target
 
 FIELD_SHARE = 0.5
@@ -68,7 +68,7 @@ def place_of(options: WorldOptions, preset: Preset, distance_um: float) -> tuple
     return z_um, FIELD_SHARE * preset.sensor.shape[0] * preset.sensor.pitch_um * z_um / distance_um
 
 
-def sample_picture() -> npt.NDArray[np.float32]:
+def sample_picture() -> Float32Array:
     """Load the photograph that ships with matplotlib, ``(600, 512, 3)`` float32 linear brightness, 0 to 1."""
     path = Path(_folder_of("matplotlib"), "mpl-data", "sample_data", "grace_hopper.jpg")
     bgr = cv2.imread(str(path), cv2.IMREAD_COLOR)

@@ -11,10 +11,10 @@ from drivers.device import DriverOptions, SharedPart
 from drivers.simulated.scenes import SHEET_SHARE
 from drivers.simulated.slm import PanelOptions, SimulatedPanel
 from drivers.simulated.world import SimulatedWorld
+from recon.arrays import Float32Array, Float64Array
 from recon.optics.scene import Layer, Scene, picture
 
 _FINER = 2  # cells of the rendered picture along a pixel: a turned pixel keeps its place within a tenth
-Floats = npt.NDArray[np.float64]
 
 
 class ScreenOptions(PanelOptions):
@@ -75,7 +75,7 @@ class SimulatedScreen(SimulatedPanel):
         shown = self._layers(glow * np.float32(options.white * (1 - options.black)))
         self.world.light_screen(*self._black, *shown)
 
-    def place_um(self, rows: Floats, columns: Floats) -> Floats:
+    def place_um(self, rows: Float64Array, columns: Float64Array) -> Float64Array:
         """Return where pixels appear in the plane of the middle, (..., 2) as ``x, y``; pixels in numbers."""
         height, width = self.shape
         u = (columns - (width - 1) / 2) * self.pixel_pitch_um
@@ -99,7 +99,7 @@ class SimulatedScreen(SimulatedPanel):
             layers += (picture(wall, self.z_um, side_um * self.z_um / world.distance_um, name="room"),)
         return layers
 
-    def _layers(self, radiance: npt.NDArray[np.float32]) -> tuple[Scene, ...]:
+    def _layers(self, radiance: Float32Array) -> tuple[Scene, ...]:
         """Return the screen's pixels as a picture parallel to the sensor; empty where none of them glows.
 
         As far as its light gets to the sensor. It has one size whatever glows, so that all pictures are

@@ -18,6 +18,7 @@ from drivers.simulated.surroundings import SimulatedDevice, Surroundings
 from drivers.simulated.wire import SLM_LINE
 from drivers.simulated.world import SimulatedWorld
 from drivers.slm import Slm, read_only
+from recon.arrays import Float32Array
 
 Side = Annotated[int, Field(ge=1, le=8192)]
 
@@ -167,7 +168,7 @@ class SimulatedSlm(SimulatedPanel):
         super().close()
 
     @property
-    def phase_rad(self) -> npt.NDArray[np.float32]:
+    def phase_rad(self) -> Float32Array:
         """The phase that light truly gains at each pixel now; what no real SLM would tell."""
         table = self.options.phase_at_full_level_rad * (np.arange(256) / 255) ** self.options.lut_gamma
         return table.astype(np.float32)[self._displayed]

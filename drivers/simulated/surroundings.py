@@ -9,13 +9,13 @@ from datetime import UTC, datetime, timedelta
 from typing import Any, ClassVar
 
 import numpy as np
-import numpy.typing as npt
 from pydantic import Field
 
 from drivers.device import Device, DeviceIdentity, DriverOptions, SharedPart
 from drivers.errors import DeviceError, DeviceNotOpenError
 from drivers.simulated.faults import FaultOptions, with_late_hot
 from drivers.simulated.wire import WireFaults, Wires
+from recon.arrays import Float32Array
 from recon.optics.sensor import FixedPattern, SensorSpec, fixed_pattern
 
 
@@ -111,9 +111,7 @@ class Surroundings(SharedPart):
         """From LED array and SLM to the camera."""
 
     @abstractmethod
-    def photons_per_s(
-        self, weights: tuple[float, float, float], binning: int = 1
-    ) -> npt.NDArray[np.float32] | None:
+    def photons_per_s(self, weights: tuple[float, float, float], binning: int = 1) -> Float32Array | None:
         """Photons a second on every binned pixel now, or None when all is dark.
 
         Parameters
@@ -124,7 +122,7 @@ class Surroundings(SharedPart):
 
     def coarse_photons_per_s(
         self, weights: tuple[float, float, float], binning: int = 1
-    ) -> tuple[npt.NDArray[np.float32], int] | None:
+    ) -> tuple[Float32Array, int] | None:
         """Return :meth:`photons_per_s` coarsely where that takes seconds, and how many pixels are one."""
         del weights, binning
         return None

@@ -8,7 +8,6 @@ from functools import partial
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from drivers.device import DriverOptions
 from drivers.simulated import kept_light
@@ -17,6 +16,7 @@ from drivers.simulated.options import PRESETS, Preset, WorldOptions
 from drivers.simulated.scene_light import SceneLight
 from drivers.simulated.scenes import make_scene, make_slide, place_of
 from drivers.simulated.surroundings import CommonOptions, Surroundings
+from recon.arrays import Float32Array
 from recon.optics.animal import Animal, draw_animal
 from recon.optics.diffuser import Diffuser, microlens_diffuser, smooth_diffuser
 from recon.optics.fall_off import (
@@ -34,7 +34,6 @@ from recon.types import Geometry
 
 Position = tuple[float, float, float]
 Rgb = tuple[float, float, float]
-Image = npt.NDArray[np.float32]
 
 CACHE_BYTES = 256 << 20
 SOURCES_KEPT = 96
@@ -75,7 +74,7 @@ class SimulatedWorld(Surroundings):
             preset.source_diameter_um if options.source_diameter_um is None else options.source_diameter_um
         )
         self._propagator: WavePropagator | None = None
-        self._cache: OrderedDict[Any, Image] = OrderedDict()
+        self._cache: OrderedDict[Any, Float32Array] = OrderedDict()
         self._emission: Rgb = (0.0, 0.0, 0.0)
         self._carrier: Callable[[], Position] = lambda: (0.0, 0.0, 1e3 * preset.source_distance_mm)
         self.animal: Animal | None = None
@@ -153,7 +152,7 @@ class SimulatedWorld(Surroundings):
         rest_y, rest_x = (side - side // binning * binning for side in self.sensor.shape)
         return PixelGrid((height, width), pitch * binning, (-rest_x / 2 * pitch, -rest_y / 2 * pitch))
 
-    def psf(self, source_um: Position, weights: Rgb, binning: int = 1) -> Image:
+    def psf(self, source_um: Position, weights: Rgb, binning: int = 1) -> Float32Array:
         """Light of a point source on the binned pixels, with the sensor's angular response.
 
         Parameters
@@ -173,7 +172,7 @@ class SimulatedWorld(Surroundings):
         source = (round(source_um[0], 3), round(source_um[1], 3), round(source_um[2], 3))
         return self._mixed(("psf", source), weights, binning, lambda band: self._psf(source, band, binning))
 
-    def _psf(self, source: Position, weights: Rgb, binning: int) -> Image:
+    def _psf(self, source: Position, weights: Rgb, binning: int) -> Float32Array:
         grid = self.sensor_grid(binning)
         spectrum = mixed_spectrum(weights, self.options.spectral_samples)
         # Not the propagator's psf(), which keeps a second copy.
@@ -189,10 +188,10 @@ class SimulatedWorld(Surroundings):
         return light
 
     def _mixed(
-        self, what: tuple[Any, ...], weights: Rgb, binning: int, make: Callable[[Rgb], Image]
-    ) -> Image:
+        self, what: tuple[Any, ...], weights: Rgb, binning: int, make: Callable[[Rgb], Float32Array]
+    ) -> Float32Array:
         """Return light in proportions of the bands; each band's is computed once, whichever pixel asks."""
-        total: Image | None = None
+        total: Float32Array | None = None
         for band, weight in zip(BAND_WEIGHTS, weights, strict=True):
             if weight:
                 light = self._cached((*what, band, binning), partial(make, band))
@@ -201,7 +200,7 @@ class SimulatedWorld(Surroundings):
                 total = light if total is None else total + light
         return np.zeros(self.sensor_grid(binning).shape, np.float32) if total is None else total
 
-    def photons_per_s(self, weights: Rgb, binning: int = 1) -> Image | None:
+    def photons_per_s(self, weights: Rgb, binning: int = 1) -> Float32Array | None:
         """Photons a second on every binned pixel now, or None when all is dark."""
         light = None
         glow = product(self.emission, weights)
@@ -227,7 +226,7 @@ class SimulatedWorld(Surroundings):
                 light = picture if light is None else light + picture
         return light
 
-    def coarse_photons_per_s(self, weights: Rgb, binning: int = 1) -> tuple[Image, int] | None:
+    def coarse_photons_per_s(self, weights: Rgb, binning: int = 1) -> tuple[Float32Array, int] | None:
         """Return the light of a glowing scene in large pixels, of few nodes and one wavelength.
 
         None where that of every pixel is there, or takes no seconds.
@@ -252,10 +251,10 @@ class SimulatedWorld(Surroundings):
 
     def _picture(
         self, what: tuple[Any, ...], scene: Scene, leds: SceneLight | None, weights: Rgb, binning: int
-    ) -> Image:
+    ) -> Float32Array:
         """Return light of a scene that glows, or is lit by LEDs: at once where all is grey, else by bands."""
 
-        def render_in(seen: Rgb) -> Image:
+        def render_in(seen: Rgb) -> Float32Array:
             if leds is not None:
                 return self._render(leds.on(scene), seen, binning)
             name = self._kept_by(scene, seen, binning) if what[0] == "scene" else None
@@ -272,7 +271,7 @@ class SimulatedWorld(Surroundings):
 
     def _render(
         self, scene: Scene, weights: Rgb, binning: int, settings: RenderSettings | None = None
-    ) -> Image:
+    ) -> Float32Array:
         return render(
             scene,
             weights,
@@ -293,7 +292,7 @@ class SimulatedWorld(Surroundings):
         options = self.options.model_dump(exclude=set(CommonOptions.model_fields) - {"seed"})
         return kept_light.name_of(scene, self.preset, options, weights, grid)
 
-    def _alive(self, animal: Animal, seen: Rgb, binning: int) -> Image:
+    def _alive(self, animal: Animal, seen: Rgb, binning: int) -> Float32Array:
         with self._lock:
             if (seen, binning) not in self._living:
                 # Large, and a camera has one binning at a time.
@@ -362,7 +361,7 @@ class SimulatedWorld(Surroundings):
         source_um: Position | None = None,
         color: bool = False,
         collected: bool = False,
-    ) -> Image:
+    ) -> Float32Array:
         """Return the true scene on a reconstruction's grid.
 
         Parameters
@@ -410,7 +409,7 @@ class SimulatedWorld(Surroundings):
             fall_off=self.fall_off if collected else None,
         )
 
-    def _cached(self, key: Any, make: Callable[[], Image]) -> Image:
+    def _cached(self, key: Any, make: Callable[[], Float32Array]) -> Float32Array:
         with self._lock:
             if key in self._cache:
                 self._cache.move_to_end(key)

@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 from PySide6.QtCore import Signal
 from PySide6.QtWidgets import QCompleter, QWidget
 
@@ -30,6 +29,7 @@ from instrument.reconstruction.request import (
     request_of,
 )
 from instrument.reconstruction.result_file import Outputs, write_reconstruction, write_volume
+from recon.arrays import Float32Array
 from recon.base.as_python import Imports, expression
 from recon.base.declare import option, options_of
 from recon.priors import PRIORS
@@ -262,7 +262,7 @@ class SoFar:
     share: float
     note: str
     prepared: Prepared
-    image: npt.NDArray[np.float32] | None = None
+    image: Float32Array | None = None
     history: tuple[IterationRecord, ...] = ()
 
 
@@ -317,7 +317,7 @@ def reconstruct_job(work: ReconstructionWork, context: JobContext) -> Written:
     share, note = 0.0, ""
     foretold = Foretold(foretell, Like.of(prepared, request.options))
 
-    def watch(record: IterationRecord, present: Callable[[], npt.NDArray[np.float32]]) -> None:
+    def watch(record: IterationRecord, present: Callable[[], Float32Array]) -> None:
         history.append(record)
         foretold.watch(record, present)
         # Of a picture its only plane.

@@ -6,7 +6,6 @@ from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 import pyqtgraph as pg
 from PySide6.QtWidgets import QButtonGroup, QHeaderView, QWidget
 
@@ -22,6 +21,7 @@ from gui.widgets.image_view import ImageView
 from gui.widgets.orientation import follow_orientation
 from gui.widgets.plots import curve_pen, dots, plot_widget
 from instrument.files.errors import percent
+from recon.arrays import Float64Array
 from recon.holography.pose import NAMES
 
 _TRIED = {
@@ -208,7 +208,7 @@ class DisplacementPlot:
         self._tails.setData([], [])
         self._say(self.words)
 
-    def show_field(self, field: npt.NDArray[np.float64], mask_shape: tuple[int, int]) -> None:
+    def show_field(self, field: Float64Array, mask_shape: tuple[int, int]) -> None:
         """Show a field.
 
         Parameters
@@ -309,7 +309,7 @@ class PoseView(QWidget):
         if self.report is not None:
             self.show_report(self.report)
 
-    def _draw(self, plot: Any, names: tuple[str, ...], factors: npt.NDArray[np.float64]) -> None:
+    def _draw(self, plot: Any, names: tuple[str, ...], factors: Float64Array) -> None:
         report = self.report
         assert report is not None
         rows = [NAMES.index(name) for name in names]

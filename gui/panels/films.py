@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 import pyqtgraph as pg
 from PySide6.QtCore import QSignalBlocker, Qt
 from PySide6.QtWidgets import QSlider, QStackedWidget, QWidget
@@ -36,6 +35,7 @@ from gui.widgets.measure import Measure
 from gui.widgets.orientation import orientation_of
 from gui.widgets.plots import LevelsBar, curve_colour, curve_pen, plot_widget
 from instrument.reconstruction.film import Film, curves, relative, slowed, write_film
+from recon.arrays import Array, Float64Array
 from recon.base.as_python import Imports, expression
 
 _FASTEST_MS = 20
@@ -52,7 +52,7 @@ class FilmsPanel(Panel):
     def __init__(self, session: BenchSession, parent: QWidget | None = None) -> None:
         super().__init__(session, parent)
         self.film: Film | None = None
-        self.courses: npt.NDArray[np.float64] = np.empty((0, 0))
+        self.courses: Float64Array = np.empty((0, 0))
         """Means of the regions, (n_regions, n_pictures), as far as they were read."""
         self._place = 0
         self._step = 1
@@ -133,7 +133,7 @@ class FilmsPanel(Panel):
     def open(self, path: Path) -> Job:
         """Open a film, in a job; it is shown when it is there, or the last line says why not."""
 
-        def work(_: JobContext) -> tuple[Film, tuple[float, float], npt.NDArray[Any]]:
+        def work(_: JobContext) -> tuple[Film, tuple[float, float], Array]:
             film = Film(path)
             return film, film.levels(), film.read(0)
 
@@ -141,7 +141,7 @@ class FilmsPanel(Panel):
         job.succeeded.connect(lambda opened: self._opened(job, *opened))
         return job
 
-    def _opened(self, job: Job, film: Film, levels: tuple[float, float], first: npt.NDArray[Any]) -> None:
+    def _opened(self, job: Job, film: Film, levels: tuple[float, float], first: Array) -> None:
         if job is not self._opening:
             return  # another was asked for since
         self.accepted()
@@ -184,7 +184,7 @@ class FilmsPanel(Panel):
             self.slider.setValue(place)
         self._reader.ask(lambda: (place, film.read(place)), self._show)
 
-    def _show(self, read: tuple[int, npt.NDArray[Any]]) -> None:
+    def _show(self, read: tuple[int, Array]) -> None:
         place, picture = read
         if self.film is None:
             return
@@ -241,7 +241,7 @@ class FilmsPanel(Panel):
             self._curves_job.cancel()
         self._colour_regions()
 
-        def work(context: JobContext) -> npt.NDArray[np.float64]:
+        def work(context: JobContext) -> Float64Array:
             return curves(film, regions, lambda done, total: context.report(done / total))
 
         self._curves_job = job = self.follow(self.jobs.compute("Reading the curves of regions", work))
@@ -268,7 +268,7 @@ class FilmsPanel(Panel):
         """Draw each region in its curve's colour."""
         self.measure.set_colours([curve_colour(number) for number in range(len(self.measure.regions))])
 
-    def _take_curves(self, job: Job, courses: npt.NDArray[np.float64]) -> None:
+    def _take_curves(self, job: Job, courses: Float64Array) -> None:
         if job is self._curves_job:
             self.courses = courses
             self._draw_curves()

@@ -7,7 +7,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-import numpy.typing as npt
 from PySide6.QtWidgets import QStackedWidget, QVBoxLayout, QWidget
 
 from calibration_routines.display.hologram_photograph import Photographed
@@ -37,6 +36,7 @@ from instrument.display.hologram import field_picture, field_words, square
 from instrument.files.errors import BenchError
 from instrument.files.images import read_image
 from instrument.reconstruction.forecast import Forecast
+from recon.arrays import Array
 from recon.base.as_python import expression
 from recon.base.declare import option, options_of
 from recon.errors import InputError
@@ -388,7 +388,7 @@ class HologramsPanel(Panel):
             return  # refused at its field
         self._suggest_out()
 
-        def read() -> tuple[object, npt.NDArray[Any], str] | str | None:
+        def read() -> tuple[object, Array, str] | str | None:
             try:
                 wanted = (path, path.stat().st_mtime_ns, fit, srgb)
                 if wanted == self._target_shown:
@@ -400,7 +400,7 @@ class HologramsPanel(Panel):
 
         self._reader.ask(read, self._target_read)
 
-    def _target_read(self, read: tuple[object, npt.NDArray[Any], str] | str | None) -> None:
+    def _target_read(self, read: tuple[object, Array, str] | str | None) -> None:
         if isinstance(read, str):
             self._target_shown = None
             self.form.refuse("picture", read)

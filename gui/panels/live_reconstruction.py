@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Any, cast
 
 import numpy as np
-import numpy.typing as npt
 from PySide6.QtGui import QHideEvent
 from PySide6.QtWidgets import QComboBox, QWidget
 
@@ -32,6 +31,7 @@ from instrument.files.calibration_file import calibration_name, find_calibration
 from instrument.files.errors import BenchError, count, duration
 from instrument.live.light_log import NOTHING_LIT
 from instrument.live.live import LiveResult
+from recon.arrays import Array, Float32Array
 from recon.base.as_python import Imports, expression
 from recon.base.declare import options_of
 from recon.reconstruction.options import ReconstructionOptions
@@ -69,7 +69,7 @@ class _SoFar:
     iteration: int
     most_left_s: float
     """Time to the last iteration allowed: the picture mostly settles before."""
-    image: npt.NDArray[np.float32]
+    image: Float32Array
 
 
 def _lines(words: tuple[str, str]) -> str:
@@ -396,7 +396,7 @@ class LiveReconstructionPanel(Panel):
                 self.session.log("warning", f"Live reconstruction: {warning}")
         self._logged = warnings
 
-    def _show_picture(self, image: npt.NDArray[Any]) -> None:
+    def _show_picture(self, image: Array) -> None:
         sample = image[::3, ::3]
         self.view.show_image(image, 0.0, float(np.percentile(sample, _WHITE)) or 1.0)
 
@@ -436,7 +436,7 @@ class LiveReconstructionPanel(Panel):
         image = np.array(frame.image)  # a copy: the ring's buffer is wanted back
         reconstructor = loaded.reconstructor
 
-        def work(context: JobContext) -> tuple[Reconstruction, npt.NDArray[np.float32]]:
+        def work(context: JobContext) -> tuple[Reconstruction, Float32Array]:
             self.follower.stop()
 
             def watch(record: Any, present: Any) -> None:
@@ -467,7 +467,7 @@ class LiveReconstructionPanel(Panel):
         self.status.setText(f"Refining: iteration {so_far.iteration} of at most {ITERATIONS}, {left}")
 
     def _refined(self, value: object) -> None:
-        result, shown = cast(tuple[Reconstruction, npt.NDArray[np.float32]], value)
+        result, shown = cast(tuple[Reconstruction, Float32Array], value)
         self._holds = True
         self._show_picture(shown)
         elided(

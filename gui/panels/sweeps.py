@@ -7,9 +7,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from importlib.resources import files
 from pathlib import Path
-from typing import Any
 
-import numpy.typing as npt
 from PySide6.QtGui import QImage, QPixmap
 from PySide6.QtWidgets import QWidget
 
@@ -37,9 +35,8 @@ from instrument.live.frame_view import not_stretched
 from instrument.plan import Plan
 from instrument.plan.illumination import IlluminationOptions
 from instrument.plan.model import load_plan, plan_toml
+from recon.arrays import Array
 from recon.base.declare import option
-
-Image = npt.NDArray[Any]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -236,7 +233,7 @@ class SweepsPanel(ProcedurePanel):
             words.append(f"SATURATED: {count(max(pixels, 1), 'pixel')}")
         elided(self.frame_words, ", ".join(words))
 
-    def _show_image(self, image: Image, full_scale: int | None = None) -> None:
+    def _show_image(self, image: Array, full_scale: int | None = None) -> None:
         levels = usual_levels(image)
         self.frame.show_image(
             image, *(levels if full_scale is None else not_stretched(levels, full_scale)), full_scale

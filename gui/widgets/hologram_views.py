@@ -10,7 +10,6 @@ from collections.abc import Iterator, Sequence
 from typing import Any, Literal
 
 import numpy as np
-import numpy.typing as npt
 import pyqtgraph as pg
 from PySide6.QtCore import QPointF, Qt, Signal
 from PySide6.QtWidgets import QWidget
@@ -26,6 +25,7 @@ from instrument.bench.photograph import SPOILT
 from instrument.display.hologram import square
 from instrument.display.hologram_files import drawn_pattern, score_words
 from instrument.files.errors import percent
+from recon.arrays import Array, Float64Array
 from recon.holography import HologramRecord, foveal_weights, painted_weights
 
 WeightsMode = Literal["uniform", "fovea", "painted"]
@@ -117,7 +117,7 @@ class WeightsView(StretchedImage):
         self.brush_radius = radius
         self._place_brush()
 
-    def weights(self) -> npt.NDArray[np.float64] | None:
+    def weights(self) -> Float64Array | None:
         """Return the weights over the field, or None where everything counts alike.
 
         Raises InputError when nothing counts.
@@ -143,7 +143,7 @@ class WeightsView(StretchedImage):
         self.changed.emit()
 
     # Showing -------------------------------------------------------------------------------------
-    def show_target(self, image: npt.NDArray[Any]) -> None:
+    def show_target(self, image: Array) -> None:
         """Show the target as it fills the square field, (height, width) in 0 to 1."""
         centre, radius = self.centre, self.radius
         self._size = max(image.shape)

@@ -17,8 +17,7 @@ from gui.theme import colours, grey_indices, indices_of, spares_hues, table
 from gui.widgets.building import fill
 from instrument.files.orientation import AS_IT_IS, Orientation
 from instrument.live.frame_view import SATURATED, index_table, show_indices
-
-Image = npt.NDArray[Any]
+from recon.arrays import Array
 
 _MARGIN_PX = 8
 _VEILED = 0.35
@@ -27,14 +26,14 @@ _PAN = 0.05
 """An arrow key moves what is shown by this part of it, where arrows mean nothing else."""
 
 
-def usual_levels(image: Image) -> tuple[float, float]:
+def usual_levels(image: Array) -> tuple[float, float]:
     """Return the values that an image is shown with: nearly the least and largest of every fourth pixel."""
     low, high = np.percentile(image[::4, ::4], (0.1, 99.9))
     counts = np.issubdtype(image.dtype, np.integer)  # a PSF's sum may be 1, and all of it below a hundredth
     return float(low), float(max(high, low + 1) if counts or high <= low else high)
 
 
-def _alike(one: Image, other: Image) -> bool:
+def _alike(one: Array, other: Array) -> bool:
     """Return whether two pictures are the same; a row of most that are not tells it."""
     if one.shape != other.shape:
         return False
@@ -115,7 +114,7 @@ class ImageView(QWidget):
         """Called instead of panning while the left button drags: start and present place, in pixels."""
         self._pan = self.box.mouseDragEvent
         self.box.mouseDragEvent = self._dragged
-        self.image: Image | None = None
+        self.image: Array | None = None
         self.naming = (0, 0, 1)
         """The sensor's column and row of the image's first pixel, and its pixels along one of the image's."""
         self._colour_map = colour_map or colours().colour_map
@@ -179,7 +178,7 @@ class ImageView(QWidget):
 
     def show_image(
         self,
-        image: Image,
+        image: Array,
         low: float,
         high: float,
         full_scale: int | None = None,
@@ -280,7 +279,7 @@ class ImageView(QWidget):
         super().resizeEvent(event)
         self.set_caption(self.caption)
 
-    def _step(self, image: Image) -> int:
+    def _step(self, image: Array) -> int:
         """Return how many pixels along each axis fall on one of the screen."""
         room = self.graphics.range  # its width along the picture's, however it is turned
         width = max(1.0, room.width() * self.devicePixelRatioF())
@@ -290,7 +289,7 @@ class ImageView(QWidget):
         step = int(min((right - left) * across / width, (bottom - top) * down / height))
         return max(1, min(step, int(image.shape[0]), int(image.shape[1])))
 
-    def _fill(self, image: Image, low: float, high: float, full_scale: int | None, step: int) -> None:
+    def _fill(self, image: Array, low: float, high: float, full_scale: int | None, step: int) -> None:
         if image.ndim > self._indices.ndim:
             height, width = self._indices.shape
             shown = image[::step, ::step][:height, :width]

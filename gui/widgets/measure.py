@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from typing import Any, NamedTuple
 
-import numpy.typing as npt
 import pyqtgraph as pg
 from PySide6.QtCore import QObject, QPointF, QRectF, Signal
 from PySide6.QtWidgets import QGraphicsRectItem
@@ -13,6 +12,7 @@ from PySide6.QtWidgets import QGraphicsRectItem
 from gui.theme import colours
 from gui.widgets.entry import quantity
 from gui.widgets.image_view import ImageView
+from recon.arrays import Array
 
 _BAR_SHARE = 0.25
 """Of a view's width, about: its scale bar."""
@@ -36,9 +36,7 @@ class Region(NamedTuple):
         return f"{width} x {height} at {self.columns.start}, {self.rows.start}"
 
 
-def region_words(
-    region: Region, shown: npt.NDArray[Any], shape: tuple[int, int], pitch_um: float | None
-) -> str:
+def region_words(region: Region, shown: Array, shape: tuple[int, int], pitch_um: float | None) -> str:
     """Return how large a region is, and what is in it.
 
     ``shown`` may be a smaller level of the picture, whose own ``shape`` is that of the region's pixels.

@@ -7,7 +7,6 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 import pyqtgraph as pg
 from PySide6.QtCore import QRectF, QSignalBlocker, QSize, Qt, Signal
 from PySide6.QtGui import QColor, QPainter, QPaintEvent
@@ -19,6 +18,7 @@ from gui.widgets.entry import NumberEdit
 from instrument.files.errors import percent
 from instrument.files.seen import levels_of
 from instrument.live.frame_view import FrameFigures, grouped
+from recon.arrays import Array, Float32Array
 
 # Images are (row, column) here as everywhere else in the project.
 pg.setConfigOptions(imageAxisOrder="row-major", antialias=True)
@@ -218,7 +218,7 @@ class LevelsBar(QWidget):
         """Go back to zero and the white level of the preview file."""
         self.set_levels(*self._automatic)
 
-    def set_image(self, image: npt.NDArray[Any], *, keep_levels: bool = False) -> None:
+    def set_image(self, image: Array, *, keep_levels: bool = False) -> None:
         """Show the histogram of an image, and choose its levels unless they are to be kept."""
         step = max(1, round((image.size / _MOST_PIXELS) ** 0.5))
         sample = np.asarray(image[::step, ::step], np.float32)
@@ -353,9 +353,7 @@ class HistogramPlot(QWidget):
         self.range = RangeBar()
         fill(self, (self.plot, 1), self.range)
 
-    def show_counts(
-        self, counts: npt.NDArray[np.float32], figures: FrameFigures, low: float, high: float
-    ) -> None:
+    def show_counts(self, counts: Float32Array, figures: FrameFigures, low: float, high: float) -> None:
         """Show a histogram of all counts (``instrument.live.frame_view.histogram``) and the levels in use.
 
         It reaches over what the data fill; the bar below has the sensor's whole range.

@@ -8,7 +8,6 @@ from types import MappingProxyType
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 import pyqtgraph as pg
 from PySide6.QtCore import QSignalBlocker, Qt
 from PySide6.QtGui import QResizeEvent
@@ -22,6 +21,7 @@ from gui.widgets.image_view import ImageView
 from gui.widgets.orientation import OrientationButton, follow_orientation
 from gui.widgets.plots import LevelsBar, curve_pen, legend, plot_widget
 from instrument.files.orientation import AS_IT_IS, Orientation
+from recon.arrays import Float32Array
 from recon.solvers.base import IterationRecord
 
 _GAP_PX = 10
@@ -83,8 +83,8 @@ class PictureView(QWidget):
 
     def __init__(self, session: BenchSession, parent: QWidget | None = None) -> None:
         super().__init__(parent)
-        self.picture: npt.NDArray[np.float32] | None = None
-        self.beside: dict[str, npt.NDArray[np.float32]] = {}
+        self.picture: Float32Array | None = None
+        self.beside: dict[str, Float32Array] = {}
         self.orientation = AS_IT_IS
         self.pitch_um: float | None = None
         self.image = _ScaledImage()
@@ -106,22 +106,22 @@ class PictureView(QWidget):
         follow_orientation(session, "results", self._orient)
 
     @property
-    def shown(self) -> npt.NDArray[np.float32] | None:
+    def shown(self) -> Float32Array | None:
         """The picture, or what is shown instead, as it is turned now."""
         values = self._values
         return None if values is None else self.orientation.apply(values)
 
     @property
-    def _values(self) -> npt.NDArray[np.float32] | None:
+    def _values(self) -> Float32Array | None:
         return self.beside.get(self.which.currentText(), self.picture)
 
     def show_picture(
         self,
-        picture: npt.NDArray[np.float32],
+        picture: Float32Array,
         *,
         pitch_um: float | None = None,
         keep_levels: bool = False,
-        beside: Mapping[str, npt.NDArray[np.float32] | None] = MappingProxyType({}),
+        beside: Mapping[str, Float32Array | None] = MappingProxyType({}),
     ) -> None:
         """Show a picture and what goes with it; ``pitch_um``: a pixel's size in the object's plane."""
         self.picture = picture

@@ -18,6 +18,7 @@ from gui.widgets.building import choice, fill, in_row, label, offer
 from gui.widgets.image_view import ArrowKeys
 from gui.widgets.plots import curve_pen, legend, plot_widget
 from instrument.evaluation.figures import boundary_lines, label_of, ticks_of
+from recon.arrays import Float64Array
 from recon.verdict.map import Failure
 
 _SPAN = 1.0
@@ -53,7 +54,7 @@ class StabilityView(QWidget):
         self._cursor.setZValue(3)
         self._cursor.hide()
         self.keys.left.connect(self._cursor.hide)
-        self.boundaries: dict[str, list[npt.NDArray[np.float64]]] = {}
+        self.boundaries: dict[str, list[Float64Array]] = {}
         """The lines of each method's, across and up in cells."""
         fill(
             self,
@@ -115,7 +116,7 @@ class StabilityView(QWidget):
         self.plot.setXRange(-0.5, columns - 0.5, padding=0.01)
         self.plot.setYRange(-0.5, rows - 0.5, padding=0.01)
 
-    def _write_errors(self, errors: npt.NDArray[np.float64], cells: npt.NDArray[np.uint8]) -> None:
+    def _write_errors(self, errors: Float64Array, cells: npt.NDArray[np.uint8]) -> None:
         figures = QGraphicsRectItem()  # holds what pyqtgraph's own texts take five times as long for
         for (iy, ix), error in np.ndenumerate(errors):
             if np.isfinite(error):
@@ -135,7 +136,7 @@ class StabilityView(QWidget):
         figures.setZValue(2)  # above the boundaries
         self.plot.addItem(figures, ignoreBounds=True)
 
-    def _draw_boundary(self, number: int, lines: Sequence[npt.NDArray[np.float64]], *, chosen: bool) -> None:
+    def _draw_boundary(self, number: int, lines: Sequence[Float64Array], *, chosen: bool) -> None:
         if not lines:
             return
         gap = np.full((1, 2), np.nan)
@@ -182,7 +183,7 @@ class StabilityView(QWidget):
         return ";  ".join(said)
 
 
-def _grid(rows: Sequence[Sequence[float | None]]) -> npt.NDArray[np.float64]:
+def _grid(rows: Sequence[Sequence[float | None]]) -> Float64Array:
     return np.array([[np.nan if v is None else v for v in row] for row in rows], float)
 
 
@@ -195,7 +196,7 @@ def _hint() -> str:
     )
 
 
-def _coloured(level: npt.NDArray[np.float64]) -> npt.NDArray[np.uint8]:
+def _coloured(level: Float64Array) -> npt.NDArray[np.uint8]:
     """Return (rows, columns, 3): green or dim works, red or bright fails, dark at the boundary."""
     now = colours()
     good = now.line if now.red_light_only else now.ok

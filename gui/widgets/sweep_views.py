@@ -7,7 +7,6 @@ from math import isfinite
 from typing import Any, NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 import pyqtgraph as pg
 from PySide6.QtCore import Qt, Signal
 from PySide6.QtWidgets import QHBoxLayout, QSizePolicy, QWidget
@@ -17,6 +16,7 @@ from calibration_routines.psf.sweep_watch import PointTaken
 from gui.theme import colours
 from gui.widgets.building import cell, fill, hint, split, table
 from gui.widgets.plots import dots, plot_widget
+from recon.arrays import Array
 
 Place = Mapping[str, float]
 
@@ -258,13 +258,11 @@ _SMALL_PX = 256
 _LEVELS = (0.1, 99.9)
 """Percentiles that small pictures are stretched to."""
 
-Image = npt.NDArray[Any]
-
 
 class PsfPicture(NamedTuple):
     """A PSF, and by how much it was reduced along each side: 1 as it arrived, else 8 bit for the eye."""
 
-    image: Image
+    image: Array
     reduced: int
 
 
@@ -272,10 +270,10 @@ class PsfPictures:
     """Pictures by number; of all but the newest only a small one is kept."""
 
     def __init__(self) -> None:
-        self._in_full: dict[int, Image] = {}
+        self._in_full: dict[int, Array] = {}
         self._small: dict[int, PsfPicture] = {}
 
-    def keep(self, number: int, image: Image) -> None:
+    def keep(self, number: int, image: Array) -> None:
         """Keep a picture, in place of an earlier one of the same number."""
         self._in_full.pop(number, None)
         self._small.pop(number, None)
@@ -290,7 +288,7 @@ class PsfPictures:
         return PsfPicture(image, 1) if image is not None else self._small.get(number)
 
 
-def small(image: Image) -> PsfPicture:
+def small(image: Array) -> PsfPicture:
     """Return an image, (height, width), as means of blocks stretched to 8 bit, 256 pixels wide at most."""
     factor = -(-max(image.shape) // _SMALL_PX)
     height, width = (max(1, length // factor) for length in image.shape)

@@ -19,6 +19,7 @@ from gui.widgets.image_view import ArrowKeys
 from gui.widgets.measure import round_length
 from instrument.reconstruction.rendering import Pose, Renderer, depth_shades
 from instrument.volumes.source import VolumeSource
+from recon.arrays import Float64Array
 
 _DRAG_DEG = 0.4
 """Turned for each pixel of the mouse."""
@@ -30,7 +31,7 @@ _BAR_SHARE = 0.25
 _MARGIN_PX = 14
 
 
-Planes = tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]
+Planes = tuple[Float64Array, Float64Array]
 
 
 class TurningView(QWidget):

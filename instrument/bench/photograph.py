@@ -11,6 +11,7 @@ import numpy.typing as npt
 from drivers.camera import Camera
 from drivers.frame import Frame, FrameMetadata
 from instrument.files.errors import BenchError
+from recon.arrays import Float32Array, Float64Array
 
 SPOILT = 1e-3
 """Share of saturated pixels from which a photograph is: a few are the sensor's, or a lamp's reflection."""
@@ -23,7 +24,7 @@ Progress = Callable[[int, int], object]
 class Snapshot:
     """One photograph: a frame, or the mean of several."""
 
-    image: npt.NDArray[np.uint8] | npt.NDArray[np.uint16] | npt.NDArray[np.float32]
+    image: npt.NDArray[np.uint8] | npt.NDArray[np.uint16] | Float32Array
     """``(height, width)`` or ``(height, width, 3)`` in counts, read only; the camera's uint8 or uint16 for a
     single frame, float32 for a mean."""
     metadata: FrameMetadata
@@ -46,7 +47,7 @@ class Snapshot:
 
     @classmethod
     def _mean(
-        cls, total: npt.NDArray[np.float64], metadata: Sequence[FrameMetadata], means: Sequence[float]
+        cls, total: Float64Array, metadata: Sequence[FrameMetadata], means: Sequence[float]
     ) -> Snapshot:
         mean = np.asarray(total / len(metadata), np.float32)
         mean.flags.writeable = False

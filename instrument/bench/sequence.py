@@ -28,6 +28,7 @@ from drivers.led_array import OFF, LedArray, LedPattern
 from drivers.slm import Slm
 from instrument.bench.safety import SafeStep, StepsFailedError, note_failures, try_all
 from instrument.files.errors import BenchError
+from recon.arrays import Float64Array
 
 if TYPE_CHECKING:
     from instrument.bench.bench import Bench
@@ -316,7 +317,7 @@ def _some(words: Iterable[str]) -> str:
 
 
 def _placed(
-    times_ms: npt.NDArray[np.float64], period_ms: float, slack: float
+    times_ms: Float64Array, period_ms: float, slack: float
 ) -> tuple[set[int], dict[int, float], list[float]]:
     """Put frames to places in a grid of one period: on time, late (by ms), and those of no place (at ms).
 
@@ -351,7 +352,7 @@ def _placed(
     return on_time, late_ms, extra
 
 
-def _times_ms(frames: Sequence[FrameMetadata]) -> tuple[npt.NDArray[np.float64], bool]:
+def _times_ms(frames: Sequence[FrameMetadata]) -> tuple[Float64Array, bool]:
     """Return when frames were exposed, and whether by the camera's clock: else when they came."""
     device = [frame.device_time_ns for frame in frames]
     by_device = None not in device

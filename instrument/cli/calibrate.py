@@ -11,7 +11,6 @@ from pathlib import Path
 from typing import Annotated, Any, Self
 
 import numpy as np
-import numpy.typing as npt
 import typer
 from rich.console import Console
 from rich.markup import escape
@@ -52,6 +51,7 @@ from instrument.runs.run_control import RunControl
 from instrument.runs.run_files import refuse_within
 from instrument.runs.runner import RunState, RunStatus
 from instrument.tasks.task import Given
+from recon.arrays import Float32Array
 from recon.base.declare import options_of
 from recon.types import Geometry
 
@@ -432,7 +432,7 @@ def _beads(
 
 
 def _solved(
-    taken: npt.NDArray[np.float32], slides: BeadSlides, geometry: Geometry, facts: dict[str, object]
+    taken: Float32Array, slides: BeadSlides, geometry: Geometry, facts: dict[str, object]
 ) -> BeadCalibration:
     quiet = not sys.stderr.isatty()
     before = ""

@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
-import numpy.typing as npt
 import typer
 
 from instrument.cli.app import App, BenchOption, examples, load_and_say
@@ -32,6 +31,7 @@ from instrument.files.pictures import Pixels
 from instrument.reconstruction.forecast import Forecast
 from instrument.tasks.spots import HologramInputs, make_spots, say_distance, tell_limit
 from instrument.tasks.task import Given, saying_what_is_left
+from recon.arrays import Array
 from recon.holography import (
     Display,
     HologramOptions,
@@ -231,7 +231,7 @@ def _require_light(
                     raise FileError(path, f"{which}{name}{words}")
 
 
-def _channel(picture: Pixels, channel: int | None) -> npt.NDArray[Any]:
+def _channel(picture: Pixels, channel: int | None) -> Array:
     if channel is None:
         return picture
     if picture.ndim != 3:

@@ -8,10 +8,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from instrument.files.errors import BenchError, FileError
 from instrument.files.record import RecordFormat, plain, value_of
+from recon.arrays import Float64Array
 from recon.holography import Display
 from recon.holography.learned import Learned
 from recon.holography.pose import NODES, Pose
@@ -29,7 +29,7 @@ class Alignment:
     """Left over with the stage at ``stage_position``."""
     error: Mapping[str, float]
     """Standard uncertainties, by the name of the pose's parameter."""
-    rest: npt.NDArray[np.float64]
+    rest: Float64Array
     """(rows, columns, 2): smooth displacement beyond the pose's, on the nodes of ``Pose.displacement``, mask
     pixels."""
     efficiency: float

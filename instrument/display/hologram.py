@@ -11,10 +11,10 @@ from typing import Any
 
 import cv2
 import numpy as np
-import numpy.typing as npt
 
 from instrument.files.errors import BenchError, FileError
 from instrument.files.images import ImageFile, read_image
+from recon.arrays import Array, Float64Array
 from recon.base.declare import option, record
 from recon.holography import (
     Display,
@@ -31,7 +31,6 @@ from recon.holography.options import Fit
 from recon.holography.scores import compare
 from recon.holography.target import EVERYWHERE, FIRST_ORDER, Window, band_of, near_window
 
-Image = npt.NDArray[np.float64]
 JUDGED_PX = 21
 """Along each axis, at least: the middle half has 11 then, the SSIM's window."""
 
@@ -59,9 +58,9 @@ class HologramResult:
     """A hologram and what will be seen of it, plane by plane."""
 
     hologram: Hologram
-    wanted: tuple[Image, ...]
-    seen: tuple[Image, ...]
-    unfiltered: tuple[Image, ...]
+    wanted: tuple[Float64Array, ...]
+    seen: tuple[Float64Array, ...]
+    unfiltered: tuple[Float64Array, ...]
     """Target and image through the eye's low-pass, and the image before; in units of the target's white."""
     scores: tuple[Scores, ...]
     """Alias-free, with the envelope that was asked for and all frames."""
@@ -101,7 +100,7 @@ def compute_and_judge(
     targets: Sequence[Target],
     options: HologramOptions | None = None,
     *,
-    initial: npt.NDArray[Any] | None = None,
+    initial: Array | None = None,
     callback: Callable[[HologramRecord, Any], object] | None = None,
     cancel: threading.Event | None = None,
     part: Window | None = None,
@@ -138,13 +137,13 @@ def compute_and_judge(
     return HologramResult(hologram, wanted, seen, raw, scores, efficiency, why, depths_mm)
 
 
-def within(window: Window | None, image: npt.NDArray[Any]) -> Image:
+def within(window: Window | None, image: Array) -> Float64Array:
     """Return what an image over the field, its centre in the middle, has inside a window, float64."""
     inside = image if window is None else image[window.part(image.shape)]
     return np.asarray(inside, np.float64)
 
 
-def square(image: npt.NDArray[Any]) -> Image:
+def square(image: Array) -> Float64Array:
     """Return an image over the square field, (height, width), on as many pixels along both axes, float64.
 
     What is seen has as many pixels along an axis as there is detail; looked at, it would be stretched.
@@ -157,7 +156,7 @@ def square(image: npt.NDArray[Any]) -> Image:
 
 
 def prepare_target(
-    pixels: npt.NDArray[Any],
+    pixels: Array,
     display: Display,
     options: HologramOptions | None = None,
     *,
@@ -198,7 +197,7 @@ def prepare_target(
     return Target(image, z_mm, white=white or None, window=window)
 
 
-def _placed(image: Image, window: Window) -> Image:
+def _placed(image: Float64Array, window: Window) -> Float64Array:
     """Return a picture in its window of a field that is dark elsewhere."""
     height, width = image.shape
     field = np.zeros(
@@ -229,9 +228,7 @@ def colour_shares(displays: Sequence[Display]) -> list[float]:
     return [1.0 if display.near else least / display.wavelength_nm for display in displays]
 
 
-def field_picture(
-    pixels: npt.NDArray[Any], *, fit: Fit = "cover", srgb: bool = False
-) -> npt.NDArray[np.float64]:
+def field_picture(pixels: Array, *, fit: Fit = "cover", srgb: bool = False) -> Float64Array:
     """Return a picture as it fills the square field, intensity in 0 to 1; see :class:`HologramOptions`.
 
     Stretched, it keeps its own number of pixels. Its greatest value is 1: phases dim nothing, a dark picture
@@ -257,7 +254,7 @@ def field_picture(
     return _to_white(image.mean(axis=2) if image.ndim == 3 else image)
 
 
-def unshowable(pixels: npt.NDArray[Any], options: HologramOptions | None = None) -> str:
+def unshowable(pixels: Array, options: HologramOptions | None = None) -> str:
     """Say, after a picture's name, why no hologram can show it; empty where one can."""
     options = options or HologramOptions()
     if words := _no_intensities(pixels):
@@ -268,7 +265,7 @@ def unshowable(pixels: npt.NDArray[Any], options: HologramOptions | None = None)
     return f"is black {where}, and a hologram sends its light somewhere."
 
 
-def _no_intensities(pixels: npt.NDArray[Any]) -> str:
+def _no_intensities(pixels: Array) -> str:
     finite = np.isfinite(pixels)
     if not finite.all():
         count = np.count_nonzero(~finite)
@@ -292,7 +289,7 @@ def read_picture(path: Path | str | ImageFile, options: HologramOptions | None =
 
 
 def field_words(
-    pixels: npt.NDArray[Any],
+    pixels: Array,
     fit: Fit,
     otherwise: str = "--fit contain shows all of it, --fit stretch stretches it",
     *,
@@ -315,7 +312,7 @@ def field_words(
     return " ".join(said)
 
 
-def _full_scale(pixels: npt.NDArray[Any]) -> float:
+def _full_scale(pixels: Array) -> float:
     """Return the number of full light: of the fewest bits of any camera or file that hold the picture."""
     most = float(pixels.max())
     if pixels.dtype.kind not in "ui":
@@ -323,12 +320,12 @@ def _full_scale(pixels: npt.NDArray[Any]) -> float:
     return next((2.0**bits - 1 for bits in (8, 10, 12, 14, 16) if most < 2**bits), most)
 
 
-def _to_white(image: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+def _to_white(image: Float64Array) -> Float64Array:
     """Return an image with 1 as its greatest value; a black one stays black."""
     return image / max(float(image.max()), 1e-30)
 
 
-def read_weights(path: Path) -> npt.NDArray[np.float64]:
+def read_weights(path: Path) -> Float64Array:
     """Read a weight image (grey, any scale); errors as ``read_image``."""
     pixels = read_image(path).pixels
     if pixels.ndim != 2 or pixels.min() < 0 or pixels.max() <= 0:

@@ -19,6 +19,7 @@ from instrument.files.errors import BenchError, FileError
 from instrument.files.figures import Convergence, Panel, Summary, save_figure, summary_figure
 from instrument.files.images import side_car, write_image
 from instrument.files.slm_image import field_levels, write_slm_image
+from recon.arrays import Float32Array, Float64Array
 from recon.holography import Display, HologramOptions, Scores
 from recon.holography.losses import loss_of
 from recon.holography.scores import DISSERTATION, GRIDS, METHODS, Cell, average
@@ -209,24 +210,24 @@ def is_of_light(field: npt.NDArray[np.complexfloating]) -> bool:
     return not np.any(field.imag) and bool(np.min(field.real) >= 0)
 
 
-def drawn_pattern(field: npt.NDArray[np.complexfloating]) -> npt.NDArray[np.float32]:
+def drawn_pattern(field: npt.NDArray[np.complexfloating]) -> Float32Array:
     """Return an SLM field, (height, width), as it is drawn in 0 to 2 pi: its phase, or what mirrors send."""
     if is_of_light(field):
         return np.asarray(2 * np.pi * field.real, np.float32)
     return np.asarray(np.mod(np.angle(field), 2 * np.pi), np.float32)
 
 
-def _detail(image: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+def _detail(image: Float64Array) -> Float64Array:
     """Cut out the middle of the field and sample it to squares, as the field is square."""
     height, width = image.shape
     cut = image[height * 3 // 8 : height * 5 // 8, width * 3 // 8 : width * 5 // 8]
     side = max(cut.shape)
     rows, columns = (np.arange(side) * n // side for n in cut.shape)
-    square: npt.NDArray[np.float64] = cut[np.ix_(rows, columns)]
+    square: Float64Array = cut[np.ix_(rows, columns)]
     return square
 
 
-Field = npt.NDArray[np.float64]
+Field = Float64Array
 
 
 def write_alignment_figure(

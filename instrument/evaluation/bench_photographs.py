@@ -16,13 +16,13 @@ from typing import Any
 from zipfile import BadZipFile
 
 import numpy as np
-import numpy.typing as npt
 
 from drivers.simulated.options import WorldOptions
 from drivers.simulated.world import SimulatedWorld
 from instrument.files.atomic import check_writable, whole_file
 from instrument.files.errors import FileError
 from instrument.files.sample_images import SAMPLES
+from recon.arrays import Array, Float32Array
 from recon.evaluation.chart_calibration import FINE, SCENES, Photographed, Photographs
 from recon.optics.scene import Scene, bead_volume, picture
 from recon.types import Geometry
@@ -51,7 +51,6 @@ _KEEPING_SHARE = 0.05
 """Part of the time that may go into keeping them."""
 
 Advance = Callable[[int, int], object]
-Floats = npt.NDArray[np.float32]
 
 
 class OutOfTimeError(Exception):
@@ -111,7 +110,7 @@ def photographs(size: int, path: Path, advance: Advance, *, budget_s: float = np
 class _Shot:
     """One photograph: of a point at a place (row, column, depth), or else of a slide or scene."""
 
-    light: Callable[[], npt.NDArray[Any]]
+    light: Callable[[], Array]
     place: tuple[float, float, float] | None = None
     is_scene: bool = False
 
@@ -121,12 +120,12 @@ class _Kept:
 
     def __init__(self, path: Path, key: str, shots: Sequence[_Shot]) -> None:
         self.path, self.key, self.shots = path, key, shots
-        self.images: list[Floats] = []
-        self.truths: list[Floats] = []
+        self.images: list[Float32Array] = []
+        self.truths: list[Float32Array] = []
         self._written = 0
         self._due = time.monotonic() + KEEP_S
 
-    def add(self, image: Floats, truth: Floats | None) -> None:
+    def add(self, image: Float32Array, truth: Float32Array | None) -> None:
         # The truth first: what is written has one for every scene, wherever an interruption comes.
         self.truths += [] if truth is None else [truth]
         self.images.append(image)

@@ -10,13 +10,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
-import numpy.typing as npt
 from contourpy import LineType, contour_generator
 
 from instrument.evaluation.chart import ChartData, colours_of, title_of
 from instrument.evaluation.chart_figure import chart_figure
 from instrument.files.atomic import write_text
 from instrument.files.figures import ACCENT, INK, save_figure
+from recon.arrays import Float64Array
 from recon.evaluation.scored import is_known
 
 if TYPE_CHECKING:
@@ -232,7 +232,7 @@ def _draw_map(axes: Axes, name: str, method: Mapping[str, Any], record: Mapping[
     return image
 
 
-def boundary_lines(severity: npt.NDArray[np.float64]) -> list[npt.NDArray[np.float64]]:
+def boundary_lines(severity: Float64Array) -> list[Float64Array]:
     """Return where a map (n_y, n_x) of severities crosses 1, as lines (points, 2) of x and y in cells.
 
     Interpolated on the logarithm of the severity; NaN: not known, no line goes there. A map of one row or
@@ -245,7 +245,7 @@ def boundary_lines(severity: npt.NDArray[np.float64]) -> list[npt.NDArray[np.flo
         level = level if n > 1 else np.repeat(level, 2, axis)
     known = np.ma.masked_invalid(level)
     made = contour_generator(places[1], places[0], known, name="serial", line_type=LineType.Separate)
-    return cast(list[npt.NDArray[np.float64]], made.lines(0.0))
+    return cast(list[Float64Array], made.lines(0.0))
 
 
 def ticks_of(axis: Mapping[str, Any]) -> list[str]:

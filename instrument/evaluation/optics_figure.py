@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from instrument.files.figures import mark_simulated, style
-from recon.evaluation.optics_compared import DEPTHS_UM, Comparison, Image
+from recon.arrays import Float32Array
+from recon.evaluation.optics_compared import DEPTHS_UM, Comparison
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -103,13 +104,13 @@ def _errors(axes: Axes, compared: Comparison) -> None:
     axes.legend(loc="lower center", frameon=False, ncols=2, fontsize=9, columnspacing=1.0, handlelength=1.2)
 
 
-def _show(axes: Axes, image: Image, title: str, top: float = 0.0) -> None:
+def _show(axes: Axes, image: Float32Array, title: str, top: float = 0.0) -> None:
     top = top or max(float(np.percentile(image, 99.8)), 1e-30)
     axes.imshow(image, cmap="gray", vmin=0, vmax=top, interpolation="nearest")
     axes.set_title(title, fontsize=9)
     axes.axis("off")
 
 
-def _scene(axes: Axes, image: Image, title: str, brightest: float = 0.0) -> None:
+def _scene(axes: Axes, image: Float32Array, title: str, brightest: float = 0.0) -> None:
     """Show what is around the scene, beads of all planes at one brightness: white from half of the most."""
     _show(axes, image[_MARGIN:-_MARGIN, _MARGIN:-_MARGIN], title, 0.5 * brightest)

@@ -21,7 +21,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import numpy.typing as npt
 
 from instrument.files.atomic import DOUBTFUL, whole_folder
 from instrument.files.errors import FileError
@@ -29,6 +28,7 @@ from instrument.files.ome_zarr import ome_attributes
 from instrument.files.pieces import piece_bytes
 from instrument.files.reading import folder_bytes, require_plausible
 from instrument.files.record import RecordFormat
+from recon.arrays import Array, Float32Array
 from recon.base.arguments import require_argument
 from recon.base.checks import require_calibration
 from recon.types import Calibration, Geometry
@@ -225,8 +225,8 @@ def _checksums(record: Mapping[str, Any]) -> dict[str, str]:
 def _made(
     record: Mapping[str, Any],
     path: Path,
-    psfs: npt.NDArray[np.float32],
-    background: npt.NDArray[np.float32] | None,
+    psfs: Float32Array,
+    background: Float32Array | None,
 ) -> Calibration:
     """Return the calibration of a record and its arrays; errors of many kinds where they do not go together.
 
@@ -265,7 +265,7 @@ def _write(calibration: Calibration, folder: Path) -> None:
     (folder / _JSON).write_text(CALIBRATION.text(record, indent=2), encoding="utf-8")
 
 
-def _write_ome_zarr(array: npt.NDArray[np.float32], path: Path, axes: str, pitch_um: float | None) -> None:
+def _write_ome_zarr(array: Float32Array, path: Path, axes: str, pitch_um: float | None) -> None:
     import zarr  # costs 0.3 s; only who reads or writes a calibration pays
 
     group = zarr.open_group(path, mode="w", zarr_format=3)
@@ -277,7 +277,7 @@ def _write_ome_zarr(array: npt.NDArray[np.float32], path: Path, axes: str, pitch
     group.attrs["ome"] = ome_attributes(path.name, axes, {"y": pitch_um, "x": pitch_um})
 
 
-def _read_array(path: Path, checksum: str) -> npt.NDArray[np.float32]:
+def _read_array(path: Path, checksum: str) -> Float32Array:
     with _reading(path):
         array = np.ascontiguousarray(_stored(path)[...])
     _require_checksum(path, _sha256(array), checksum)
@@ -326,5 +326,5 @@ def _require_checksum(array: Path, found: str, recorded: str) -> None:
         )
 
 
-def _sha256(array: npt.NDArray[Any]) -> str:
+def _sha256(array: Array) -> str:
     return hashlib.sha256(np.ascontiguousarray(array).data).hexdigest()

@@ -16,13 +16,13 @@ from pathlib import Path
 from typing import IO, Any
 
 import numpy as np
-import numpy.typing as npt
 
 from instrument.files import matlab, reading
 from instrument.files.errors import FileError, os_reason, size
 from instrument.files.named_arrays import Expect, is_hdf5, is_matlab, outline, read_hdf5, read_matlab
 from instrument.files.pictures import MAGIC, READABLE, Decoded, decode_picture
 from instrument.files.tiffs import RAW, decode_tiff
+from recon.arrays import Array
 
 _TIFF_MAGIC = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
 
@@ -133,7 +133,7 @@ def require_npy(path: Path) -> None:
     reading.require_plausible(path, promised, reading.stored_bytes(path))
 
 
-def _npy_outline(path: Path, file: IO[bytes], n_bytes: int) -> npt.NDArray[Any]:
+def _npy_outline(path: Path, file: IO[bytes], n_bytes: int) -> Array:
     """Read a .npy header; return the outline of what it says follows in the file's ``n_bytes``.
 
     Raises FileError.
@@ -163,7 +163,7 @@ def _decode_npy(path: Path, file: IO[bytes], n_bytes: int, expect: Expect) -> De
     expect(_npy_outline(path, file, n_bytes))
     file.seek(0)
     try:
-        array: npt.NDArray[Any] = np.load(file, allow_pickle=False)
+        array: Array = np.load(file, allow_pickle=False)
     except Exception as error:  # noqa: BLE001 - as above
         raise FileError(path, f"is damaged or no plain .npy array: {error!s:.200}.") from None
     return array, ()

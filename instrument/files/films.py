@@ -12,9 +12,10 @@ import numpy.typing as npt
 
 from instrument.files.atomic import whole_file
 from instrument.files.errors import FileError
+from recon.arrays import Array
 
 
-def as_shown(picture: npt.NDArray[Any], black: float, white: float) -> npt.NDArray[np.uint8]:
+def as_shown(picture: Array, black: float, white: float) -> npt.NDArray[np.uint8]:
     """Return a picture as 8-bit RGB, (height, width, 3); NaN is black."""
     level = np.nan_to_num((picture - black) / (white - black), nan=0.0)
     shown = np.round(255 * np.clip(level, 0, 1)).astype(np.uint8)

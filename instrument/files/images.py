@@ -49,6 +49,7 @@ from instrument.files.pictures import (
 from instrument.files.seen import as_seen, levels_of, png_bytes
 from instrument.files.tiff_pages import open_tiff
 from instrument.files.tiffs import files_of
+from recon.arrays import Array
 from recon.base.arguments import require_argument, require_numbers
 from recon.errors import InputError
 
@@ -94,7 +95,7 @@ class ImageFile:
         height, width = self.pixels.shape[:2]
         return f"{height} x {width} {'colour' if self.is_colour else 'grey'} {self.pixels.dtype}"
 
-    def __array__(self, dtype: npt.DTypeLike | None = None, copy: bool | None = None) -> npt.NDArray[Any]:
+    def __array__(self, dtype: npt.DTypeLike | None = None, copy: bool | None = None) -> Array:
         """Return the pixels."""
         return np.array(self.pixels, dtype, copy=copy)
 
@@ -190,7 +191,7 @@ def read(path: Path | str) -> ImageFile:
     return image
 
 
-def write_image(path: Path | str, image: npt.NDArray[Any], metadata: Mapping[str, Any] | None = None) -> None:
+def write_image(path: Path | str, image: Array, metadata: Mapping[str, Any] | None = None) -> None:
     """Write one ``image`` (or, as TIFF or .npy, a stack), whole or not at all.
 
     The suffix of ``path`` chooses the format: ``.tif`` and ``.npy`` keep any dtype, ``.png`` takes uint8 and
@@ -326,7 +327,7 @@ def _folders_that_do(folder: Path) -> str:
     return f"Folders in it that do: {', '.join(map(str, inside[:4]))}." if inside else ""
 
 
-def _as_stack(path: Path, array: npt.NDArray[Any], notes: tuple[str, ...]) -> ImageFile:
+def _as_stack(path: Path, array: Array, notes: tuple[str, ...]) -> ImageFile:
     if array.ndim > 3 and array.shape[-1] == 1:
         array = array[..., 0]
     while array.ndim > 3 and array.shape[0] == 1:
@@ -353,8 +354,8 @@ def _as_stack(path: Path, array: npt.NDArray[Any], notes: tuple[str, ...]) -> Im
 
 
 def _decoded(
-    path: Path, expect: Callable[[Path, npt.NDArray[Any]], object] = lambda *_: None
-) -> tuple[Path, npt.NDArray[Any], tuple[str, ...]]:
+    path: Path, expect: Callable[[Path, Array], object] = lambda *_: None
+) -> tuple[Path, Array, tuple[str, ...]]:
     """Decode a file, a Zarr folder, or an array of a file (``FILE::NAME``); returns the file with it.
 
     ``expect`` refuses, before it is read, what is not wanted: it is given the file and zeros of its shape.
@@ -375,7 +376,7 @@ def _array_of(path: Path) -> tuple[Path, str]:
 _BIG_TIFF_BYTES = 3_900_000_000
 
 
-def _write_tiff(path: Path, image: npt.NDArray[Any], text: str | None, pitch_um: float | None) -> None:
+def _write_tiff(path: Path, image: Array, text: str | None, pitch_um: float | None) -> None:
     """Write a TIFF; ImageJ knows colour of floats only as channels, and no TIFF of over 4 GB."""
     colour = image.ndim >= 3 and image.shape[-1] == 3
     known = image.ndim <= 4 and image.dtype == np.float32 and image.nbytes < _BIG_TIFF_BYTES
@@ -399,7 +400,7 @@ def _write_tiff(path: Path, image: npt.NDArray[Any], text: str | None, pitch_um:
     )
 
 
-def _write_png(path: Path, image: npt.NDArray[Any]) -> None:
+def _write_png(path: Path, image: Array) -> None:
     ordered = image[..., ::-1] if image.ndim == 3 else image
     done, data = cv2.imencode(".png", np.ascontiguousarray(ordered))
     if not done:

@@ -13,12 +13,12 @@ import zlib
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import IO, Any, NamedTuple
+from typing import IO, NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
 from instrument.files import reading
+from recon.arrays import Array
 
 _HEADER = 128
 _MATRIX, _COMPRESSED = 14, 15
@@ -78,7 +78,7 @@ def contents(path: Path) -> dict[str, MatlabArray | str]:
     return found
 
 
-def read_array(path: Path, array: MatlabArray) -> npt.NDArray[Any]:
+def read_array(path: Path, array: MatlabArray) -> Array:
     """Read an array, with the kind of number that it is stored as; errors as :func:`arrays_in`.
 
     Raises FileError when it says to be far more than the file can hold.

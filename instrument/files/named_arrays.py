@@ -24,9 +24,10 @@ from instrument.files.pieces import (
     require_pieces,
     require_szip_pieces,
 )
+from recon.arrays import Array, Float64Array
 
-Read = tuple[npt.NDArray[Any], tuple[str, ...]]
-Expect = Callable[[npt.NDArray[Any]], object]
+Read = tuple[Array, tuple[str, ...]]
+Expect = Callable[[Array], object]
 """Given zeros of the shape that will be read, which take no memory; raises where it is refused."""
 _AXES = ("t", "c", "z", "y", "x", "s")
 _COLOURS = {"S": (1, 2, 3, 4), "C": (3,)}
@@ -34,7 +35,7 @@ _COLOURS = {"S": (1, 2, 3, 4), "C": (3,)}
 _HDF5_MAGIC = b"\x89HDF\r\n\x1a\n"
 
 
-def ordered(path: Path, array: npt.NDArray[Any], axes: str) -> Read:
+def ordered(path: Path, array: Array, axes: str) -> Read:
     """Bring an array to one stack axis (where there is one), height, width, and colour (where there is one).
 
     ``axes`` has a letter an axis: Y and X, C or S for channels, others (Z, T, I ...) for images of a stack.
@@ -68,12 +69,12 @@ def ordered(path: Path, array: npt.NDArray[Any], axes: str) -> Read:
     return array, tuple(notes)
 
 
-def outline(shape: Sequence[int], dtype: npt.DTypeLike) -> npt.NDArray[Any]:
+def outline(shape: Sequence[int], dtype: npt.DTypeLike) -> Array:
     """Return zeros of a shape, which take no memory."""
     return np.broadcast_to(np.zeros((), dtype), tuple(map(int, shape)))
 
 
-def _anything(_array: npt.NDArray[Any]) -> None:
+def _anything(_array: Array) -> None:
     """Expect nothing."""
 
 
@@ -109,13 +110,13 @@ def read_hdf5(path: Path, inside: str, *, of_matlab: bool = False, expect: Expec
         if is_array and entry.dtype.kind in "biuf" and not name.startswith("#"):
             found[name] = entry.shape
 
-    def brought(name: str, array: npt.NDArray[Any]) -> Read:
+    def brought(name: str, array: Array) -> Read:
         if of_matlab:
             return _of_matlab(name, array.T)
         array, said = ordered(path, array, _letters([str(axis.label) for axis in file[name].dims]))
         return array, (f"the array {name} taken", *said)
 
-    def read(name: str) -> npt.NDArray[Any]:
+    def read(name: str) -> Array:
         if file[name].external or file[name].is_virtual:
             raise FileError(
                 path, f"keeps the numbers of {name} in other files.", "Copy them into one file (h5repack)."
@@ -149,7 +150,7 @@ def _letters(names: Sequence[Any]) -> str:
 def read_matlab(path: Path, inside: str, *, expect: Expect = _anything) -> Read:
     """Read an array of a MATLAB file of version 5 to 7; as :func:`read_hdf5`."""
 
-    def read(name: str) -> npt.NDArray[Any]:
+    def read(name: str) -> Array:
         expect(_of_matlab(name, outline(found[name].shape, np.uint8))[0])
         return matlab.read_array(path, found[name])
 
@@ -164,8 +165,8 @@ def read_matlab(path: Path, inside: str, *, expect: Expect = _anything) -> Read:
 
 
 def _chosen(
-    path: Path, found: Mapping[str, tuple[int, ...]], inside: str, read: Callable[[str], npt.NDArray[Any]]
-) -> tuple[str, npt.NDArray[Any]]:
+    path: Path, found: Mapping[str, tuple[int, ...]], inside: str, read: Callable[[str], Array]
+) -> tuple[str, Array]:
     images = [name for name, shape in found.items() if sum(side > 1 for side in shape) >= 2]
     listed = ", ".join(f"{name} {found[name]}" for name in images[:8]) or "none"
     if inside and inside not in found:
@@ -184,7 +185,7 @@ def _chosen(
     return name, read(name)
 
 
-def _of_matlab(name: str, array: npt.NDArray[Any]) -> Read:
+def _of_matlab(name: str, array: Array) -> Read:
     """Put MATLAB's last axis, which counts images, first; three planes may be colours, which is said."""
     notes = [f"the array {name} taken"]
     if array.ndim == 3 and array.shape[-1] == 3:
@@ -272,7 +273,7 @@ def zarr_facts(folder: Path) -> dict[str, Any]:
     return told
 
 
-def _places(image: Mapping[str, Any], shape: Sequence[int]) -> dict[str, npt.NDArray[np.float64]]:
+def _places(image: Mapping[str, Any], shape: Sequence[int]) -> dict[str, Float64Array]:
     """Return where an image's elements lie along each axis whose unit is known: micrometres, seconds."""
     level = image["datasets"][0]
     places = {}

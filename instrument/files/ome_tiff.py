@@ -12,9 +12,9 @@ from typing import TYPE_CHECKING, Any
 from xml.etree import ElementTree
 
 import numpy as np
-import numpy.typing as npt
 
 from instrument.files import reading
+from recon.arrays import Array, Float64Array
 
 if TYPE_CHECKING:
     import tifffile
@@ -129,7 +129,7 @@ def resolution(pitch_um: float | None) -> dict[str, Any]:
     return {"resolution": (1e4 / pitch_um, 1e4 / pitch_um), "resolutionunit": "CENTIMETER"}
 
 
-def write_ome_tiff(path: Path, image: npt.NDArray[Any], facts: Mapping[str, Any]) -> None:
+def write_ome_tiff(path: Path, image: Array, facts: Mapping[str, Any]) -> None:
     """Write an OME-TIFF of an image or stack; floats in colour channel by channel: few know RGB of them."""
     import tifffile
 
@@ -219,7 +219,7 @@ def film_facts(description: str) -> dict[str, float]:
     return found
 
 
-def depths_in_words(depths: Sequence[float] | npt.NDArray[np.float64]) -> str:
+def depths_in_words(depths: Sequence[float] | Float64Array) -> str:
     """Say at which depths a file's planes are; micrometres."""
     steps = np.diff(depths)
     if not len(steps) or not np.isfinite(steps).all():

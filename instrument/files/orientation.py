@@ -7,7 +7,8 @@ from dataclasses import dataclass
 from typing import Any, Literal
 
 import numpy as np
-import numpy.typing as npt
+
+from recon.arrays import Array
 
 Kind = Literal["frames", "results"]
 """Pictures of a camera, and reconstructed ones: all of a kind are turned alike."""
@@ -42,7 +43,7 @@ class Orientation:
         """Return this one, then mirrored as it is seen: left for right; ``upright``: top for bottom."""
         return Orientation((2 * upright - self.quarters) % 4, not self.mirrored)
 
-    def apply(self, picture: npt.NDArray[Any]) -> npt.NDArray[Any]:
+    def apply(self, picture: Array) -> Array:
         """Return a view of a picture, (height, width) or (height, width, 3), as it is looked at."""
         return np.rot90(picture[:, ::-1] if self.mirrored else picture, self.quarters)
 

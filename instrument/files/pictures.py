@@ -10,7 +10,6 @@ import math
 import struct
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
@@ -18,8 +17,9 @@ import numpy.typing as npt
 
 from instrument.files import reading
 from instrument.files.errors import FileError
+from recon.arrays import Array, Float32Array
 
-Decoded = tuple[npt.NDArray[Any], tuple[str, ...]]
+Decoded = tuple[Array, tuple[str, ...]]
 """An array as its file has it, stack first and colour last, and what was noticed in words."""
 READABLE = "TIFF, PNG, JPEG, BMP, .npy, .npz, HDF5, MATLAB, OME-Zarr"
 MOST_BYTES = 1 << 28
@@ -77,7 +77,7 @@ def quiet_opencv() -> Iterator[None]:
         cv2.utils.logging.setLogLevel(loudness)
 
 
-def rgb(array: npt.NDArray[Any]) -> npt.NDArray[Any]:
+def rgb(array: Array) -> Array:
     """Return an image of OpenCV's with its colours the other way round."""
     if array.ndim == 3 and array.shape[-1] >= 3:
         array = array[..., [2, 1, 0, *range(3, array.shape[-1])]]
@@ -89,7 +89,7 @@ def turned_in_words(orientation: int) -> str:
     return f"turned upright as its orientation ({orientation}) says"
 
 
-def upright(array: npt.NDArray[Any], orientation: int, axes: str) -> npt.NDArray[Any]:
+def upright(array: Array, orientation: int, axes: str) -> Array:
     """Turn and mirror images so that the first row is at the top (TIFF 6.0, tag 274)."""
     y, x = axes.index("Y"), axes.index("X")
     if orientation >= 5:
@@ -160,7 +160,7 @@ def _sides_of_jpeg(data: bytes) -> tuple[int, int] | None:
 
 
 # Which axes are colours, and which numbers ---------------------------------------------------------
-Pixels = npt.NDArray[np.uint8] | npt.NDArray[np.uint16] | npt.NDArray[np.float32]
+Pixels = npt.NDArray[np.uint8] | npt.NDArray[np.uint16] | Float32Array
 
 MOST_LIGHT = 1e15
 """No light has more counts; their squares are summed."""
@@ -177,9 +177,7 @@ def several_images(path: Path, count: int, further: str) -> FileError:
     return FileError(path, f"holds {count} images; a single one is expected.", remedy)
 
 
-def one_image(
-    path: Path, array: npt.NDArray[Any], several: str = ""
-) -> tuple[npt.NDArray[Any], tuple[str, ...]]:
+def one_image(path: Path, array: Array, several: str = "") -> tuple[Array, tuple[str, ...]]:
     """Return an array's only image, its colours last and without transparency, and that in words.
 
     Raises FileError where it has several, or none.
@@ -206,16 +204,14 @@ def _is_npy(path: Path) -> bool:
     return path.suffix.lower() in (".npy", ".npz")
 
 
-def drop_alpha(array: npt.NDArray[Any]) -> tuple[npt.NDArray[Any], tuple[str, ...]]:
+def drop_alpha(array: Array) -> tuple[Array, tuple[str, ...]]:
     """Return an image (..., channels) without its transparency, the second or fourth, and that in words."""
     if array.shape[-1] in (2, 4):
         return array[..., :-1], (ALPHA,)
     return array, ()
 
 
-def standard_dtype(
-    path: Path, array: npt.NDArray[Any], *, holes: bool = False
-) -> tuple[Pixels, tuple[str, ...]]:
+def standard_dtype(path: Path, array: Array, *, holes: bool = False) -> tuple[Pixels, tuple[str, ...]]:
     """Return the pixels as uint8, uint16 or float32, unscaled, and what was converted."""
     if array.dtype == np.bool_:
         return array.astype(np.uint8), ("true and false taken as 1 and 0",)
@@ -238,7 +234,7 @@ def standard_dtype(
     return pixels, () if native.dtype == np.float32 else (f"{native.dtype} taken as float32",)
 
 
-def refuse_non_finite(path: Path, array: npt.NDArray[Any], *, holes: bool) -> None:
+def refuse_non_finite(path: Path, array: Array, *, holes: bool) -> None:
     """Refuse values that are no finite numbers; with ``holes`` some may be NaN. Raises FileError."""
     finite = np.isfinite(array)
     if holes and finite.any():

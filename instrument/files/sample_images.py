@@ -15,8 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from instrument.files.errors import FileError
-
-Image = npt.NDArray[np.float64]
+from recon.arrays import Float64Array
 
 
 @dataclass(frozen=True, slots=True)
@@ -24,10 +23,10 @@ class Sample:
     """A sample picture: where it comes from, and how to get it."""
 
     source: str
-    load: Callable[[], Image]
+    load: Callable[[], Float64Array]
 
 
-def load_sample(name: str, shape: tuple[int, int]) -> Image:
+def load_sample(name: str, shape: tuple[int, int]) -> Float64Array:
     """Return a sample picture resampled to a shape (stretched: the field of view is square)."""
     image = SAMPLES[name].load()
     shrinks = shape[0] <= image.shape[0] and shape[1] <= image.shape[1]
@@ -44,7 +43,7 @@ def _matplotlib_file(name: str) -> Path:
     return path
 
 
-def _portrait() -> Image:
+def _portrait() -> Float64Array:
     image = cv2.imread(str(_matplotlib_file("grace_hopper.jpg")), cv2.IMREAD_GRAYSCALE)
     assert image is not None
     return image[:512, :].astype(np.float64) / 255
@@ -58,22 +57,22 @@ def portrait_in_colour(side: int) -> npt.NDArray[np.uint8]:
     return np.ascontiguousarray(small[..., ::-1])
 
 
-def _relief() -> Image:
+def _relief() -> Float64Array:
     """Elevation, lit from the north-west."""
     with np.load(_matplotlib_file("jacksboro_fault_dem.npz")) as file:
-        elevation: Image = file["elevation"].astype(np.float64)[:344, :344]
+        elevation: Float64Array = file["elevation"].astype(np.float64)[:344, :344]
     y, x = np.gradient(elevation, 90.0)
     return np.asarray(np.clip(0.5 + 1.2 * (x - y), 0, 1), np.float64)
 
 
-def _head() -> Image:
+def _head() -> Float64Array:
     """Magnetic resonance slice."""
     with gzip.open(_matplotlib_file("s1045.ima.gz")) as file:
         pixels = np.frombuffer(file.read(), np.uint16).reshape(256, 256)
     return np.asarray(pixels / float(pixels.max()), np.float64)
 
 
-def dead_leaves(seed: int, contrast: float) -> Image:
+def dead_leaves(seed: int, contrast: float) -> Float64Array:
     """Dead leaves: overlapping discs of all sizes, whose statistics are like a photograph's."""
     n = 512
     rng = np.random.default_rng(seed)
@@ -89,7 +88,7 @@ def dead_leaves(seed: int, contrast: float) -> Image:
     return image
 
 
-def _clouds() -> Image:
+def _clouds() -> Float64Array:
     """Noise with the 1/f spectrum of photographs."""
     n = 512
     f = np.hypot(np.fft.fftfreq(n)[:, None], np.fft.rfftfreq(n)[None, :])

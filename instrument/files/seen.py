@@ -8,6 +8,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from recon.arrays import Array
+
 WHITE_PERCENTILE = 99.8
 """What is shown white; brighter pixels are white too."""
 BLACK_PERCENTILE = 0.2
@@ -34,7 +36,7 @@ class Levels:
         }
 
 
-def levels_of(image: npt.NDArray[Any], *, raw: bool = False) -> Levels:
+def levels_of(image: Array, *, raw: bool = False) -> Levels:
     """Find what is to be shown black and white.
 
     Parameters
@@ -52,7 +54,7 @@ def levels_of(image: npt.NDArray[Any], *, raw: bool = False) -> Levels:
     return Levels(black, tuple(max(white, (brightest - black) / MOST_BALANCE + black) for white in whites))
 
 
-def _white(channel: npt.NDArray[Any], black: float) -> float:
+def _white(channel: Array, black: float) -> float:
     white = float(np.percentile(channel, WHITE_PERCENTILE))
     if white <= black:  # few points of light
         white = float(channel.max())
@@ -68,9 +70,7 @@ def srgb(light: npt.NDArray[np.floating]) -> npt.NDArray[np.floating]:
     return shown
 
 
-def as_seen(
-    image: npt.NDArray[Any], levels: Levels | None = None, *, raw: bool = False
-) -> npt.NDArray[np.uint8]:
+def as_seen(image: Array, levels: Levels | None = None, *, raw: bool = False) -> npt.NDArray[np.uint8]:
     """Return 8-bit pixels for a screen, (height, width) or (height, width, 3).
 
     Parameters

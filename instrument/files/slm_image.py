@@ -18,6 +18,7 @@ from drivers.slm import Slm
 from instrument.files.errors import FileError
 from instrument.files.images import read_image, side_car, write_image
 from instrument.files.record import RecordFormat
+from recon.arrays import Array, Float64Array
 
 SLM_CALIBRATION = RecordFormat(
     "diffuserbench SLM calibration", "SLM calibration", make="Make one: diffuserbench calibrate slm"
@@ -28,9 +29,9 @@ SLM_CALIBRATION = RecordFormat(
 class SlmCorrection:
     """How one SLM answers."""
 
-    phase_of_level_rad: npt.NDArray[np.float64]
+    phase_of_level_rad: Float64Array
     """(256,): phase that each level really gives, relative to level 0."""
-    flatness_rad: npt.NDArray[np.float64] | None = None
+    flatness_rad: Float64Array | None = None
     """(height, width): phase error over the SLM at any sampling, to be taken off."""
 
     @classmethod
@@ -111,9 +112,7 @@ MIRRORS = RecordFormat("diffuserbench mirror pattern", "description of a pattern
 LEVELS = 256
 
 
-def field_levels(
-    field: npt.NDArray[Any], binning: int = 1, *, mirrors: bool = False
-) -> npt.NDArray[np.uint8]:
+def field_levels(field: Array, binning: int = 1, *, mirrors: bool = False) -> npt.NDArray[np.uint8]:
     """Return the ideal levels of an SLM field, complex (height, width): its phase, or what mirrors send.
 
     A field that mirrors cannot send, not real or negative, is their first order: they show fringes.
@@ -128,7 +127,7 @@ def field_levels(
     return np.repeat(np.repeat(sent, binning, axis=-2), binning, axis=-1)
 
 
-def levels_field(levels: npt.NDArray[np.uint8], binning: int, *, mirrors: bool) -> npt.NDArray[Any]:
+def levels_field(levels: npt.NDArray[np.uint8], binning: int, *, mirrors: bool) -> Array:
     """Return the field that a pattern's levels stand for, complex (height, width)."""
     if mirrors:
         return np.asarray(levels[::binning, ::binning] / 255, np.complex64)
@@ -157,15 +156,15 @@ def is_of_mirrors(facts: Mapping[str, Any]) -> bool:
     return facts.get("options", {}).get("mirrors") is not None
 
 
-def phase_levels(phase_rad: npt.NDArray[Any], binning: int = 1) -> npt.NDArray[np.uint8]:
+def phase_levels(phase_rad: Array, binning: int = 1) -> npt.NDArray[np.uint8]:
     """Return phases as ideal levels, uint8, each pixel repeated ``binning`` times along both axes."""
     levels = np.mod(np.rint(np.asarray(phase_rad) * (LEVELS / (2 * np.pi))), LEVELS).astype(np.uint8)
     return np.repeat(np.repeat(levels, binning, axis=-2), binning, axis=-1)
 
 
-def levels_phase(levels: npt.NDArray[np.uint8], binning: int = 1) -> npt.NDArray[np.float64]:
+def levels_phase(levels: npt.NDArray[np.uint8], binning: int = 1) -> Float64Array:
     """Return the phase of ideal levels, float64, one value for each ``binning`` x ``binning`` pixels."""
-    phase: npt.NDArray[np.float64] = levels[..., ::binning, ::binning].astype(np.float64)
+    phase: Float64Array = levels[..., ::binning, ::binning].astype(np.float64)
     return phase * (2 * np.pi / LEVELS)
 
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import functools
 import threading
 from dataclasses import dataclass
-from typing import Any
 
 import cv2
 import numpy as np
@@ -13,6 +12,7 @@ import numpy.typing as npt
 
 from drivers.camera import Roi
 from drivers.frame import FrameMetadata
+from recon.arrays import Array, Float32Array, Float64Array
 from recon.optics.jit import compiled
 
 SATURATED = 255
@@ -47,9 +47,7 @@ def index_table(
 
 
 @compiled
-def fill_indices(
-    image: npt.NDArray[Any], table: npt.NDArray[np.uint8], step: int, out: npt.NDArray[np.uint8]
-) -> None:
+def fill_indices(image: Array, table: npt.NDArray[np.uint8], step: int, out: npt.NDArray[np.uint8]) -> None:
     """Look counts up in a table, taking one pixel of each ``step`` x ``step``.
 
     A block with a saturated pixel is saturated as a whole: shrinking an image must not hide saturation.
@@ -90,9 +88,7 @@ def compile_for_frames() -> None:
     _compiled.set()
 
 
-def show_indices(
-    image: npt.NDArray[Any], table: npt.NDArray[np.uint8], step: int, out: npt.NDArray[np.uint8]
-) -> None:
+def show_indices(image: Array, table: npt.NDArray[np.uint8], step: int, out: npt.NDArray[np.uint8]) -> None:
     """Do what :func:`fill_indices` does, by NumPy as long as that is not compiled: who waited would hang.
 
     The image is read only, as a frame is: of another kind it would be compiled anew.
@@ -109,16 +105,14 @@ def show_indices(
         out[table[functools.reduce(np.maximum, parts)] == SATURATED] = SATURATED
 
 
-def histogram(image: Counts) -> npt.NDArray[np.float32]:
+def histogram(image: Counts) -> Float32Array:
     """Return how many pixels (of all channels) have each count: of all of the raw data, at its full depth."""
     flat = image.reshape(image.shape[0], -1)
     n = np.iinfo(image.dtype).max + 1
     return np.asarray(cv2.calcHist([flat], [0], None, [n], [0, n]), np.float32).ravel()
 
 
-def grouped(
-    counts: npt.NDArray[np.float32], first: int, last: int, bins: int = 256
-) -> tuple[npt.NDArray[np.float32], int]:
+def grouped(counts: Float32Array, first: int, last: int, bins: int = 256) -> tuple[Float32Array, int]:
     """Return a histogram from one count to another in ``bins`` equal steps, and a step's size in counts."""
     used = counts[first : last + 1]
     size = -(-len(used) // bins)
@@ -139,7 +133,7 @@ class FrameFigures:
     """Share of the pixels at full scale."""
 
     @classmethod
-    def of(cls, counts: npt.NDArray[np.float32], full_scale: int) -> FrameFigures:
+    def of(cls, counts: Float32Array, full_scale: int) -> FrameFigures:
         """Return the figures of a histogram of all counts."""
         there = np.flatnonzero(counts)
         total = float(counts.sum(dtype=np.float64))
@@ -161,7 +155,7 @@ class FrameFigures:
         return first, min(self.full_scale, (self.largest // part + 1) * part - 1)
 
 
-def percentiles(counts: npt.NDArray[np.float32], low: float, high: float) -> tuple[float, float]:
+def percentiles(counts: Float32Array, low: float, high: float) -> tuple[float, float]:
     """Return the counts below which ``low`` and ``high`` per cent of a histogram's pixels lie."""
     total = np.cumsum(counts, dtype=np.float64)
     at = np.searchsorted(total, np.array([low, high]) / 100 * total[-1])
@@ -175,8 +169,8 @@ def not_stretched(levels: tuple[float, float], full_scale: int) -> tuple[float, 
 
 
 def line_profile(
-    image: npt.NDArray[Any], start: tuple[float, float], end: tuple[float, float]
-) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
+    image: Array, start: tuple[float, float], end: tuple[float, float]
+) -> tuple[Float64Array, Float64Array]:
     """Return distance in pixels and value along a line, about one sample a pixel, linear between pixels.
 
     Parameters

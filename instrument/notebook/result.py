@@ -28,6 +28,7 @@ from instrument.reconstruction.result_file import (
     write_reconstruction,
     write_volume,
 )
+from recon.arrays import Array
 from recon.base.arguments import require_argument
 from recon.reconstruction.result import Reconstruction
 from recon.types import Calibration
@@ -62,9 +63,9 @@ class Result(Reconstruction):
         values = {f.name: getattr(told, f.name) for f in fields(Reconstruction)}
         return cls(**values, job=job_in_python(job), typed=(found, job))
 
-    def __array__(self, dtype: npt.DTypeLike | None = None, copy: bool | None = None) -> npt.NDArray[Any]:
+    def __array__(self, dtype: npt.DTypeLike | None = None, copy: bool | None = None) -> Array:
         """Return the picture's pixels, (height, width) or with colours last; of a volume all its planes."""
-        pixels: npt.NDArray[Any] = self.image if self.is_picture else self.volume
+        pixels: Array = self.image if self.is_picture else self.volume
         return np.array(pixels, dtype, copy=copy)
 
     def facts(self) -> Mapping[str, str]:
@@ -144,7 +145,7 @@ class Result(Reconstruction):
             require_new(page, overwrite=overwrite)
         if out.suffix.lower() in (".png", ".npy"):
             require_new(out, overwrite=overwrite)
-            pixels: npt.NDArray[Any] = self.seen(rotate_deg=rotate_deg)
+            pixels: Array = self.seen(rotate_deg=rotate_deg)
             if out.suffix.lower() == ".npy":
                 pixels = np.rot90(self.image, turns) if self.is_picture else self.volume
             write_image(out, pixels)

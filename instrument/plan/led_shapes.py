@@ -8,12 +8,12 @@ from dataclasses import dataclass, replace
 from typing import Any, ClassVar, Protocol, Self
 
 import numpy as np
-import numpy.typing as npt
 
 from drivers.led_array import LedPattern, Rgb
+from recon.arrays import BoolArray, Float64Array
 from recon.base.declare import option
 
-LitLeds = npt.NDArray[np.bool_]
+LitLeds = BoolArray
 WHITE: Rgb = (255, 255, 255)
 
 
@@ -21,11 +21,11 @@ class LedPlaces(Protocol):
     """What a pattern is composed for: an LED array, or its places alone."""
 
     @property
-    def led_positions_mm(self) -> npt.NDArray[np.float64]:
+    def led_positions_mm(self) -> Float64Array:
         """``(n_leds, 3)``: x, y, z."""
 
     @property
-    def led_na(self) -> npt.NDArray[np.float64]:
+    def led_na(self) -> Float64Array:
         """``(n_leds, 2)``: sines of the illumination angle in x and y."""
 
 
@@ -68,7 +68,7 @@ def _na(default: float = 0.25) -> Any:
     )
 
 
-def _radius(array: LedPlaces) -> npt.NDArray[np.float64]:
+def _radius(array: LedPlaces) -> Float64Array:
     return np.hypot(array.led_na[:, 0], array.led_na[:, 1])
 
 

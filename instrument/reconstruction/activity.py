@@ -10,24 +10,17 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from instrument.files.atomic import whole_file, write_json, write_text
 from instrument.files.errors import BenchError, FileError
 from instrument.files.films import write_mp4
 from instrument.files.record import plain
-from instrument.reconstruction.video_files import (
-    DEFAULT_FPS,
-    VideoPictures,
-    create_output,
-    levels_of,
-)
+from instrument.reconstruction.video_files import DEFAULT_FPS, VideoPictures, create_output, levels_of
+from recon.arrays import Float32Array, Float64Array
 from recon.base.declare import option
 from recon.streams.activity import LEAST_FRAMES, baseline, change, fading, floor_of, smoothed
 from recon.streams.motion import Motion, aligned, motion
 from recon.streams.regions import Region, Search, find_regions, local_correlation, noise_of
-
-Floats = npt.NDArray[np.float32]
 
 WINDOW_S = 30.0
 """Of the sliding baseline, where the video's times are known; as many frames as at 10 a second otherwise."""
@@ -87,14 +80,14 @@ class Activity:
 
     indices: tuple[int, ...]
     """The video's frames that there are; all arrays below hold these."""
-    times_s: npt.NDArray[np.float64]
+    times_s: Float64Array
     """float64, (n_frames,): frame numbers, where the video's times are not known."""
-    frames: Floats
-    dff: Floats
+    frames: Float32Array
+    dff: Float32Array
     """float32, (n_frames, height, width): fluorescence, and its relative change."""
     search: Search
     """Regions, what was left out, and the local correlation, float32, (height, width)."""
-    traces: Floats
+    traces: Float32Array
     """float32, (n_regions, n_frames): dF/F of the regions' mean fluorescence."""
     motion: Motion
     """Before alignment."""

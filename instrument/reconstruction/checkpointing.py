@@ -17,7 +17,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from instrument.files.atomic import (
     check_writable,
@@ -33,6 +32,7 @@ from instrument.files.record import plain
 from instrument.reconstruction.job import Job
 from instrument.reconstruction.patterned import PatternedRequest
 from instrument.reconstruction.request import PictureRequest, VolumeRequest
+from recon.arrays import Array, Float64Array
 from recon.base.declare import identity
 from recon.reconstruction.measurement import Measurement
 from recon.reconstruction.solvers import SOLVERS
@@ -322,7 +322,7 @@ def _is_state(path: Path) -> bool:
     return f"{_HISTORY}.npy" in names and any(name.startswith(_STATE) for name in names)
 
 
-def digest(array: npt.NDArray[Any] | None) -> str | None:
+def digest(array: Array | None) -> str | None:
     """Return what tells an array from others: shape, and the beginning of its SHA-256."""
     if array is None:
         return None
@@ -330,7 +330,7 @@ def digest(array: npt.NDArray[Any] | None) -> str | None:
     return f"{' x '.join(map(str, array.shape))} {array.dtype}, {text}"
 
 
-def _record(row: npt.NDArray[np.float64]) -> IterationRecord:
+def _record(row: Float64Array) -> IterationRecord:
     values = dict(zip((f.name for f in fields(IterationRecord)), row.tolist(), strict=True))
     return IterationRecord(**values | {"iteration": int(values["iteration"])})
 
@@ -368,11 +368,11 @@ def _state(kept: Any) -> dict[str, Any]:
     return nested
 
 
-def _value(array: npt.NDArray[Any]) -> Any:
+def _value(array: Array) -> Any:
     return array.item() if array.ndim == 0 else array
 
 
-def _nested(flat: Mapping[str, npt.NDArray[Any]]) -> Any:
+def _nested(flat: Mapping[str, Array]) -> Any:
     """Undo :func:`_flat`; arrays of no dimension become numbers again."""
     tree: dict[str, Any] = {}
     for path, value in flat.items():

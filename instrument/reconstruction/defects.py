@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
-import numpy.typing as npt
 
-FloatImage = npt.NDArray[np.float32]
+from recon.arrays import Array, BoolArray, Float32Array
+
+FloatImage = Float32Array
 
 SPREAD = 0.01
 """Share of a PSF's pixels above a fifth of its maximum from which its light is spread out: spots of lenslets
@@ -35,7 +34,7 @@ WHOLE, MOST_LINES = 0.9, 8
 of the sensor; and so many lines at most: more is a bright field."""
 
 
-def mended_psf(pixels: npt.NDArray[Any]) -> tuple[npt.NDArray[Any], int]:
+def mended_psf(pixels: Array) -> tuple[Array, int]:
     """Return a PSF image whose hot and dead pixels are filled by their neighbours, and how many those were.
 
     They are told by the PSF alone, however many there are: each differs from its neighbours, which do not
@@ -57,7 +56,7 @@ def mended_psf(pixels: npt.NDArray[Any]) -> tuple[npt.NDArray[Any], int]:
     return stack[0] if count else pixels, count
 
 
-def mended_stack(stack: npt.NDArray[Any]) -> tuple[npt.NDArray[Any], int]:
+def mended_stack(stack: Array) -> tuple[Array, int]:
     """Fill hot and dead pixels of the PSFs of several depths: those that stand alone at most of them.
 
     A defect stays where it is, and is filled at every depth then; a point in focus at one of them is light.
@@ -87,7 +86,7 @@ def mended_stack(stack: npt.NDArray[Any]) -> tuple[npt.NDArray[Any], int]:
     return filled, count
 
 
-def _defective(pixels: npt.NDArray[Any]) -> npt.NDArray[np.bool_]:
+def _defective(pixels: Array) -> BoolArray:
     """Return which pixels of a PSF (height, width[, n_channels]) no light through it differs on alone."""
     channels = pixels[..., None] if pixels.ndim == 2 else pixels
     found = np.zeros(channels.shape, bool)
@@ -117,7 +116,7 @@ def _alikeness(plane: FloatImage) -> float:
     return float(min(both)) / power if power else 0.0
 
 
-def _alone(plane: FloatImage, odd: FloatImage) -> npt.NDArray[np.bool_]:
+def _alone(plane: FloatImage, odd: FloatImage) -> BoolArray:
     """Return where a pixel lies beyond its four neighbours by far more than its eight are ``odd``."""
     near = _four_neighbours(plane)
     beyond = np.maximum(plane - np.max(near, axis=0), np.min(near, axis=0) - plane)
@@ -134,7 +133,7 @@ def _alone(plane: FloatImage, odd: FloatImage) -> npt.NDArray[np.bool_]:
     return where
 
 
-def whole_lines(saturated: npt.NDArray[np.bool_]) -> str:
+def whole_lines(saturated: BoolArray) -> str:
     """Name the whole columns or rows, from 0, that nearly all saturated pixels lie in; "" where they do not.
 
     Parameters
@@ -150,17 +149,17 @@ def whole_lines(saturated: npt.NDArray[np.bool_]) -> str:
     return ""
 
 
-def is_spread(psf: npt.NDArray[Any]) -> bool:
+def is_spread(psf: Array) -> bool:
     """Tell whether the light of a PSF (height, width) is spread out: none of it is on one pixel alone."""
     level = _level(psf)
     return bool(np.mean(psf - level > (psf.max() - level) / 5) >= SPREAD)
 
 
-def _level(psf: npt.NDArray[Any]) -> float:
+def _level(psf: Array) -> float:
     return float(np.median(psf[[0, 0, -1, -1], [0, -1, 0, -1]]))
 
 
-def defective_pixels(pixels: npt.NDArray[Any], psf: npt.NDArray[Any]) -> npt.NDArray[np.bool_]:
+def defective_pixels(pixels: Array, psf: Array) -> BoolArray:
     """Return which pixels are hot or dead, in their shape: no light through this PSF differs so on one pixel.
 
     None where the PSF (height, width[, n_channels]) has spots as narrow, as sharp lenslets have.
@@ -180,7 +179,7 @@ def defective_pixels(pixels: npt.NDArray[Any], psf: npt.NDArray[Any]) -> npt.NDA
     return defective.reshape(pixels.shape)
 
 
-def _oddness(plane: npt.NDArray[Any]) -> FloatImage:
+def _oddness(plane: Array) -> FloatImage:
     """Return how far pixels differ from the middle two of their four neighbours, (height, width)."""
     known = np.asarray(plane, np.float32)
     if np.isnan(known).any():  # holes

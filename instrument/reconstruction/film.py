@@ -29,6 +29,7 @@ from instrument.reconstruction.video_files import (
 from instrument.runs.export import export
 from instrument.runs.run import Run
 from instrument.volumes.writing import write_film_tiff
+from recon.arrays import Array, Float64Array
 
 if TYPE_CHECKING:
     from recon.camera.grid import Grid
@@ -98,7 +99,7 @@ class Film:
         return "frames" if self.is_recording else "results"
 
     @property
-    def times_s(self) -> npt.NDArray[np.float64]:
+    def times_s(self) -> Float64Array:
         """Of its pictures; their numbers, where the rate is not known."""
         return np.array(self.indices) * (self.period_s or 1.0)
 
@@ -110,7 +111,7 @@ class Film:
     def __len__(self) -> int:
         return len(self.indices)
 
-    def read(self, place: int) -> npt.NDArray[Any]:
+    def read(self, place: int) -> Array:
         """Return the picture at a place among those that there are, (height, width[, 3])."""
         index = self.indices[place]
         if self._video is not None:
@@ -118,7 +119,7 @@ class Film:
         assert self._run is not None
         return self._run.frame(index)
 
-    def whole(self, place: int) -> npt.NDArray[Any]:
+    def whole(self, place: int) -> Array:
         """Return all that is kept of a picture: of a volume its planes, ([n_z,] height, width[, 3])."""
         return self.read(place) if self._video is None else self._video.read(self.indices[place])
 
@@ -163,7 +164,7 @@ def is_film(path: Path) -> bool:
     return True
 
 
-def curves(film: Film, regions: Sequence[Window], advance: Advance | None = None) -> npt.NDArray[np.float64]:
+def curves(film: Film, regions: Sequence[Window], advance: Advance | None = None) -> Float64Array:
     """Return the mean of regions in every picture, (n_regions, n_pictures); colours are averaged.
 
     ``advance``: ``advance(pictures done, pictures)`` after each; may raise to end the work.
@@ -177,10 +178,10 @@ def curves(film: Film, regions: Sequence[Window], advance: Advance | None = None
     return found
 
 
-def relative(courses: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+def relative(courses: Float64Array) -> Float64Array:
     """Return dF/F: the change against each course's own 20th percentile, relative to that."""
     base = np.percentile(courses, BASELINE_PERCENTILE, axis=-1, keepdims=True)
-    changes: npt.NDArray[np.float64] = (courses - base) / np.maximum(np.abs(base), 1e-12)
+    changes: Float64Array = (courses - base) / np.maximum(np.abs(base), 1e-12)
     return changes
 
 
@@ -256,7 +257,7 @@ def slowed(target: Path, fps: float) -> str:
     return f"{target.name}: a GIF shows {most:g} pictures a second at most; it plays at {most / fps:.2g} x."
 
 
-def curves_csv(film: Film, regions: Sequence[Window], courses: npt.NDArray[np.float64]) -> str:
+def curves_csv(film: Film, regions: Sequence[Window], courses: Float64Array) -> str:
     """Return the means of regions and their dF/F as CSV, a line a picture; columns say where regions lie."""
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
@@ -272,7 +273,7 @@ def curves_csv(film: Film, regions: Sequence[Window], courses: npt.NDArray[np.fl
     return text.getvalue()
 
 
-def _pictures(film: Film, advance: Advance | None, *, whole: bool = False) -> Iterator[npt.NDArray[Any]]:
+def _pictures(film: Film, advance: Advance | None, *, whole: bool = False) -> Iterator[Array]:
     for place in range(len(film)):
         yield film.whole(place) if whole else film.read(place)
         if advance is not None:

@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from instrument.files.calibration_file import find_calibration, load_calibration
 from instrument.files.errors import BenchError, FileError, percent
@@ -43,6 +42,7 @@ from instrument.reconstruction.preparation import (
     saturated_pixels,
 )
 from instrument.reconstruction.straightened import require_no_counts, straightened, straightened_dark
+from recon.arrays import Array, BoolArray
 from recon.base.marks import Marks, marks_of
 from recon.base.noise import NoiseModel, averaged_noise
 from recon.camera.factors import Pattern
@@ -67,13 +67,11 @@ class Reduction:
     mosaic: Pattern | None = None
     """Of a raw frame, whose colours come apart."""
 
-    def apply(self, pixels: npt.NDArray[Any]) -> FloatImage:
+    def apply(self, pixels: Array) -> FloatImage:
         """Return a photograph (height, width[, 3]) as a measurement."""
         return self.seen(pixels)[0]
 
-    def seen(
-        self, pixels: npt.NDArray[Any], valid: npt.NDArray[np.bool_] | None = None
-    ) -> tuple[FloatImage, npt.NDArray[np.bool_] | None]:
+    def seen(self, pixels: Array, valid: BoolArray | None = None) -> tuple[FloatImage, BoolArray | None]:
         """Return the same, and which of its ``valid`` pixels were measured; None where all are."""
         if self.mosaic is None:
             binned = bin_image(pixels, self.first_binning) if self.first_binning > 1 else pixels
@@ -93,7 +91,7 @@ class Job:
     """On the measurement's pixels."""
     notes: Mapping[str, str]
     """What was read and chosen, to be shown: ``"Dark"`` to ``"34.1 counts from both ..."``."""
-    valid: npt.NDArray[np.bool_] | None = None
+    valid: BoolArray | None = None
     """bool, shape of the measurement or (height, width), or None: the pixels that take part; None means all
     of them."""
     warnings: tuple[str, ...] = ()
@@ -330,7 +328,7 @@ def _calibration_of(psf: FloatImage, file: ImageFile) -> Calibration:
     )
 
 
-def _reduced_valid(erased: Erased, crop: Crop | None, factor: int) -> npt.NDArray[np.bool_] | None:
+def _reduced_valid(erased: Erased, crop: Crop | None, factor: int) -> BoolArray | None:
     """Return the mask on the measurement's pixels; refused where it leaves nothing."""
     if erased.valid is None:
         return None

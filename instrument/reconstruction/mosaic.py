@@ -6,11 +6,11 @@ from dataclasses import replace
 from typing import Literal, get_args
 
 import numpy as np
-import numpy.typing as npt
 
 from instrument.files.errors import BenchError, FileError
 from instrument.files.images import ImageFile
 from instrument.reconstruction.preparation import Crop, FloatImage, reduce
+from recon.arrays import BoolArray, Float32Array
 from recon.camera.factors import PATTERNS, Pattern, interpolate_bayer, split_bayer
 from recon.errors import InputError
 from recon.types import Calibration
@@ -44,7 +44,7 @@ def mosaic_of(image: ImageFile) -> Pattern | None:
     return None if image.is_colour else _named(str(image.metadata.get("pixel_format", "")))
 
 
-def in_colours(image: npt.NDArray[np.float32], pixel_format: str) -> npt.NDArray[np.float32]:
+def in_colours(image: Float32Array, pixel_format: str) -> Float32Array:
     """Return a raw frame of a mosaic sensor as (height, width, 3), interpolated; any other image as it is."""
     pattern = None if image.ndim == 3 else _named(pixel_format)
     return image if pattern is None else interpolate_bayer(image, pattern)
@@ -112,7 +112,7 @@ def require_whole_cells(image: ImageFile, match: int) -> None:
 
 def reduce_mosaic(
     raw: FloatImage, pattern: Pattern, crop: Crop | None, binning: int
-) -> tuple[FloatImage, npt.NDArray[np.bool_]]:
+) -> tuple[FloatImage, BoolArray]:
     """Split a raw frame into colours, cut the window out and average each colour's pixels.
 
     Raises BenchError when the binning is odd.
@@ -170,7 +170,7 @@ def mosaic_psf(psf: FloatImage, pattern: Pattern, crop: Crop | None, factor: int
 
 def matched_mosaic(
     raw: FloatImage, pattern: Pattern, match: int, crop: Crop | None, factor: int
-) -> tuple[FloatImage, npt.NDArray[np.bool_]]:
+) -> tuple[FloatImage, BoolArray]:
     """Bring a raw frame to a calibration's pixels, then cut and bin on those."""
     if match == 1:
         return reduce_mosaic(raw, pattern, crop, factor)

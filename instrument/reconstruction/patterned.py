@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from instrument.files.calibration_file import find_calibration, load_calibration
 from instrument.files.decoding import require_npy
@@ -24,14 +23,13 @@ from instrument.reconstruction.options import InputOptions
 from instrument.reconstruction.request import refocused
 from instrument.runs.run import Run
 from recon import Measurement, reconstruct
+from recon.arrays import BoolArray, Float32Array
 from recon.reconstruction.options import ReconstructionOptions
 from recon.reconstruction.problem import Stage
 from recon.reconstruction.result import Reconstruction
 from recon.solvers.base import IterationRecord, Keeper
 from recon.solvers.memory import MemoryMeter
 from recon.types import Calibration
-
-Floats = npt.NDArray[np.float32]
 
 WHOLE_COLOURS = (
     "each with all colours of the mosaic (--bin 1: the sensor's own, a quarter of them red or blue)"
@@ -197,9 +195,9 @@ class _Lit:
 
     job: Job
     """Of the first one."""
-    frames: Floats
+    frames: Float32Array
     """(n_patterns, height, width[, 3]): less the dark frame."""
-    erased: npt.NDArray[np.bool_] | None
+    erased: BoolArray | None
 
     @classmethod
     def of(cls, run: Run, calibration: Calibration, folder: Path, inputs: InputOptions) -> _Lit:
@@ -250,7 +248,7 @@ def _require_same_plan(run: Run, sheet: Run) -> None:
         )
 
 
-def _patterns_from_file(path: Path, shape: tuple[int, ...]) -> Floats:
+def _patterns_from_file(path: Path, shape: tuple[int, ...]) -> Float32Array:
     try:
         require_npy(path)
         patterns = np.load(path, allow_pickle=False)
@@ -268,7 +266,7 @@ def _patterns_from_file(path: Path, shape: tuple[int, ...]) -> Floats:
 
 def _patterns_of(
     sheet: _Lit, job: Job, request: PatternedRequest, on_progress: Callable[[int, int], object]
-) -> tuple[Floats, float]:
+) -> tuple[Float32Array, float]:
     """Reconstruct the sheet under each group, smooth, and take the share of each in all of them.
 
     Beside it: how rough the sheet is in all light.
@@ -283,30 +281,30 @@ def _patterns_of(
     return _shares(smooth, request.sheet), _roughness(np.sum(pictures, axis=0))
 
 
-def _look(measurement: Measurement, job: Job, request: PatternedRequest) -> Floats:
+def _look(measurement: Measurement, job: Job, request: PatternedRequest) -> Float32Array:
     """Return a quick grey picture in one light."""
     image = reconstruct(
         measurement, job.calibration, z_um=request.options.z_um, solver="admm", iterations=SHEET_ITERATIONS,
         model="convolution", judged=False,
     ).image  # fmt: skip
-    grey: Floats = image.mean(axis=-1) if image.ndim == 3 else image
+    grey: Float32Array = image.mean(axis=-1) if image.ndim == 3 else image
     return grey
 
 
-def _smoothed(picture: Floats) -> Floats:
+def _smoothed(picture: Float32Array) -> Float32Array:
     from scipy.ndimage import gaussian_filter
 
-    smooth: Floats = gaussian_filter(picture, SMOOTHING_SHARE * min(picture.shape))
+    smooth: Float32Array = gaussian_filter(picture, SMOOTHING_SHARE * min(picture.shape))
     return smooth
 
 
-def _roughness(picture: Floats) -> float:
+def _roughness(picture: Float32Array) -> float:
     """Return what smoothing takes off a picture, relative to it."""
     whole = float(np.linalg.norm(picture))
     return float(np.linalg.norm(picture - _smoothed(picture))) / whole if whole > 0 else 0.0
 
 
-def _shares(patterns: Floats, path: Path) -> Floats:
+def _shares(patterns: Float32Array, path: Path) -> Float32Array:
     """Return what part of the light of all patterns each has; none where there is next to no light."""
     total = patterns.sum(axis=0)
     bright = float(np.percentile(total, BRIGHT_PERCENTILE))

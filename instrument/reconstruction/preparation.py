@@ -11,18 +11,18 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
-import numpy.typing as npt
 
 from instrument.files.errors import BenchError, FileError, count, percent
 from instrument.files.images import ImageFile, read_image
 from instrument.reconstruction.defects import defective_pixels, whole_lines
+from recon.arrays import Array, BoolArray, Float32Array
 from recon.base.blocks import block_mean
 from recon.base.checks import saturated_share
 from recon.base.sloping_light import rise_of, sloping_light
 from recon.errors import InputError
 from recon.types import Calibration
 
-FloatImage = npt.NDArray[np.float32]
+FloatImage = Float32Array
 
 ErasuresChoice = Literal["none", "saturated"] | float | Path
 """Nothing; saturated pixels; a random share; a mask file, zero where a pixel is erased."""
@@ -129,7 +129,7 @@ def check_psf(psf: ImageFile, *, allow_saturated: bool = False) -> tuple[str, ..
     return (f"{found}.",)
 
 
-def saturated_pixels(pixels: npt.NDArray[Any]) -> npt.NDArray[np.bool_]:
+def saturated_pixels(pixels: Array) -> BoolArray:
     """Return which pixels are at full scale, in their shape, as far as an image can tell; channels apart.
 
     They are at their channel's maximum, where that is a full scale and is reached more than once, or where
@@ -148,7 +148,7 @@ def saturated_pixels(pixels: npt.NDArray[Any]) -> npt.NDArray[np.bool_]:
     return saturated.reshape(pixels.shape)
 
 
-def is_full_scale(pixels: npt.NDArray[Any]) -> bool:
+def is_full_scale(pixels: Array) -> bool:
     """Tell whether the maximum is that of an 8, 10, 12, 14 or 16 bit sensor, left-aligned in 16 bit too."""
     return pixels.dtype.kind == "u" and int(pixels.max()) in _FULL_SCALES
 
@@ -196,7 +196,7 @@ _MOST_BRIGHTER, _BRIGHTER_BY, _SURE, _SIDE = 0.1, 0.05, 4.0, 8
 and how many standard deviations of noise."""
 
 
-def _brighter_share(dark: npt.NDArray[Any], image: npt.NDArray[Any]) -> float:
+def _brighter_share(dark: Array, image: Array) -> float:
     """Return in what share of the picture a dark frame is clearly brighter than a photograph."""
     greys = [np.nan_to_num(pixels.astype(np.float64)) for pixels in (dark, image)]
     greys = [grey.mean(axis=-1) if grey.ndim == 3 else grey for grey in greys]
@@ -257,7 +257,7 @@ def both_raw(psf: ImageFile, image: ImageFile) -> bool:
     return bool(fewest < counts.max() <= most and counts.min() >= 0 and not (counts % 1).any())
 
 
-def darkest_corner(pixels: npt.NDArray[Any]) -> tuple[float, str]:
+def darkest_corner(pixels: Array) -> tuple[float, str]:
     """Return the mean of a PSF's darkest corner, and which it is."""
     height, width = pixels.shape[:2]
     margin = min(_MARGIN, height // 4, width // 4)
@@ -274,7 +274,7 @@ def darkest_corner(pixels: npt.NDArray[Any]) -> tuple[float, str]:
     return means[name], name
 
 
-def darkest_block(pixels: npt.NDArray[Any]) -> float:
+def darkest_block(pixels: Array) -> float:
     """Return the mean of an image's darkest block of 10 x 10 pixels (smaller in a smaller image)."""
     grey = pixels.mean(axis=-1, dtype=np.float32) if pixels.ndim == 3 else pixels
     return float(np.nanmin(bin_image(grey, max(1, min(_PATCH, *grey.shape)))))
@@ -316,7 +316,7 @@ def auto_binning(shape: tuple[int, int]) -> int:
     return factor
 
 
-def bin_image(image: npt.NDArray[Any], factor: int) -> FloatImage:
+def bin_image(image: Array, factor: int) -> FloatImage:
     """Return the mean of ``factor`` x ``factor`` pixels, float32; a rest at the right and bottom is left out.
 
     Raises BenchError when the image is smaller than one binned pixel.
@@ -331,7 +331,7 @@ def bin_image(image: npt.NDArray[Any], factor: int) -> FloatImage:
     return np.ascontiguousarray(np.moveaxis(block_mean(np.moveaxis(image, -1, 0), factor), 0, -1))
 
 
-def reduce(pixels: npt.NDArray[Any], dark: float | FloatImage, crop: Crop | None, binning: int) -> FloatImage:
+def reduce(pixels: Array, dark: float | FloatImage, crop: Crop | None, binning: int) -> FloatImage:
     """Subtract the dark level, cut the window out, bin; float32, negative values kept.
 
     Raises BenchError when binning leaves less than :data:`LEAST_BINNED` pixels along a side.
@@ -357,11 +357,11 @@ def reduce(pixels: npt.NDArray[Any], dark: float | FloatImage, crop: Crop | None
 class Erased:
     """Which pixels are valid, ``(height, width)`` or ``(height, width, 3)``; None means all of them."""
 
-    valid: npt.NDArray[np.bool_] | None
+    valid: BoolArray | None
     reason: str
 
 
-def erasures_of(choice: ErasuresChoice, image: ImageFile, psf: npt.NDArray[Any] | None = None) -> Erased:
+def erasures_of(choice: ErasuresChoice, image: ImageFile, psf: Array | None = None) -> Erased:
     """Return which pixels of an image take part; with a ``psf`` defective ones count as saturated.
 
     Raises BenchError or FileError when the share is not from 0 to below 1, or the mask does not fit or leaves
@@ -379,7 +379,7 @@ def erasures_of(choice: ErasuresChoice, image: ImageFile, psf: npt.NDArray[Any] 
     return Erased(keep, f"{1 - keep.mean():.1%} of the pixels, at random (seed {SEED})")
 
 
-def reduce_valid(valid: npt.NDArray[np.bool_], crop: Crop | None, binning: int) -> npt.NDArray[np.bool_]:
+def reduce_valid(valid: BoolArray, crop: Crop | None, binning: int) -> BoolArray:
     """Cut and bin a mask like its image: a binned pixel is valid where all of its pixels are."""
     if crop is not None:
         valid = valid[crop.slices((valid.shape[0], valid.shape[1]))]
@@ -390,7 +390,7 @@ def reduce_valid(valid: npt.NDArray[np.bool_], crop: Crop | None, binning: int) 
     return np.asarray(blocks.all(axis=(1, 3)))
 
 
-def _saturated(image: ImageFile, psf: npt.NDArray[Any] | None) -> Erased:
+def _saturated(image: ImageFile, psf: Array | None) -> Erased:
     saturated = saturated_pixels(image.pixels)
     left_out = saturated if psf is None else saturated | defective_pixels(image.pixels, psf)
     unknown = int(np.count_nonzero(np.isnan(image.pixels)))

@@ -11,6 +11,7 @@ import numpy.typing as npt
 
 from instrument.reconstruction.result_figures import grey
 from instrument.volumes.source import VolumeSource
+from recon.arrays import Float32Array, Float64Array
 from recon.base.blocks import block_mean
 from recon.base.threads import in_blocks
 
@@ -37,12 +38,12 @@ class Pose:
         return Pose((self.azimuth_deg + azimuth_deg) % 360.0, tilt)
 
     @property
-    def matrix(self) -> npt.NDArray[np.float64]:
+    def matrix(self) -> Float64Array:
         """Rotation, (3, 3), from the volume's z, y, x to depth, down and right of the view."""
         a, e = math.radians(self.azimuth_deg), math.radians(self.elevation_deg)
         about_y = np.array([[math.cos(a), 0, -math.sin(a)], [0, 1, 0], [math.sin(a), 0, math.cos(a)]])
         about_x = np.array([[math.cos(e), math.sin(e), 0], [-math.sin(e), math.cos(e), 0], [0, 0, 1]])
-        rotation: npt.NDArray[np.float64] = about_x @ about_y
+        rotation: Float64Array = about_x @ about_y
         return rotation
 
 
@@ -160,14 +161,14 @@ class Renderer:
         )
         return out
 
-    def along_depth(self, rows: slice, columns: slice) -> npt.NDArray[np.float32]:
+    def along_depth(self, rows: slice, columns: slice) -> Float32Array:
         """Return the mean of a window of the volume in each plane, float32, (n_z,); rows of the volume."""
         b = self.reduced
         n_rows, n_columns = self._copies[0].shape[1:]
         top, left = min(rows.start // b, n_rows - 1), min(columns.start // b, n_columns - 1)
         bottom, right = max(-(-rows.stop // b), top + 1), max(-(-columns.stop // b), left + 1)
         inside = self._copies[0][:, top:bottom, left:right]
-        means: npt.NDArray[np.float32] = inside.mean(axis=(1, 2), dtype=np.float32)
+        means: Float32Array = inside.mean(axis=(1, 2), dtype=np.float32)
         return means * np.float32(self.white / _FULL)
 
 

@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from instrument.files.calibration_file import is_calibration
 from instrument.files.errors import BenchError
@@ -31,6 +30,7 @@ from instrument.reconstruction.preparation import darkest_block
 from instrument.reconstruction.straightened import straightened
 from instrument.runs.run_files import STATE
 from instrument.volumes.grid_facts import numbers
+from recon.arrays import Float32Array, Float64Array
 from recon.base.checks import require_noise, select_psf
 from recon.base.declare import record
 from recon.camera.camera_model import ModelName, members_of_depths
@@ -50,7 +50,7 @@ from recon.types import Calibration, Geometry
 
 READ_WITH, PREPARED, PSF_STACK = "options", "prepared", "psf_stack"
 """What of a volume's recorded inputs tells how they were read, what came of them, and of PSFs from files."""
-Watch = Callable[[IterationRecord, Callable[[], npt.NDArray[np.float32]]], object]
+Watch = Callable[[IterationRecord, Callable[[], Float32Array]], object]
 """Called after each iteration with its record and what makes the present picture or volume."""
 
 
@@ -278,7 +278,7 @@ def volume_job(psfs: Path | ImageFile, image: Path | ImageFile, inputs: InputOpt
     )
 
 
-def _places_um(psfs: ImageFile) -> tuple[npt.NDArray[np.float64], str]:
+def _places_um(psfs: ImageFile) -> tuple[Float64Array, str]:
     """Return where the sources of a stack's PSFs were, (n, 3), NaN for what is not known; and what to say."""
     places_um = np.full((len(psfs.pixels), 3), np.nan)
     if not psfs.metadata.get("depths_um"):

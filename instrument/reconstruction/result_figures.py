@@ -14,13 +14,14 @@ from instrument.files.figures import Convergence, Panel, Summary, save_figure, s
 from instrument.files.seen import as_seen, srgb
 from instrument.reconstruction.job import Job
 from instrument.volumes.source import VolumeSource
+from recon.arrays import Float32Array, Float64Array
 from recon.base.blocks import block_sum
 from recon.reconstruction.result import Reconstruction
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-Grey = npt.NDArray[np.float32]
+Grey = Float32Array
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,9 +66,7 @@ def grey(plane: Grey) -> Grey:
     return plane if plane.ndim == 2 else plane.mean(axis=-1, dtype=np.float32)
 
 
-def in_colour_of_depth(
-    front: Grey, deepest: npt.NDArray[np.integer], n_z: int, white: float
-) -> npt.NDArray[np.float64]:
+def in_colour_of_depth(front: Grey, deepest: npt.NDArray[np.integer], n_z: int, white: float) -> Float64Array:
     """Return the brightest voxels over depth, (height, width, 3) in 0 to 1, their hue by their depth.
 
     Blue is the first plane, red the last. ``white`` is the value shown at full brightness.
@@ -75,7 +74,7 @@ def in_colour_of_depth(
     from matplotlib import colormaps
 
     hue = colormaps["turbo"](0.1 + 0.8 * np.arange(n_z) / max(n_z - 1, 1))[:, :3]
-    shown: npt.NDArray[np.float64] = hue[deepest] * (front / white).clip(0, 1)[..., None]
+    shown: Float64Array = hue[deepest] * (front / white).clip(0, 1)[..., None]
     return shown
 
 
@@ -133,7 +132,7 @@ def volume_figure(result: Reconstruction, *, simulated: bool = False) -> Figure:
     return figure
 
 
-def _white(image: npt.NDArray[np.float32]) -> float:
+def _white(image: Float32Array) -> float:
     level = float(np.percentile(image, _WHITE_PERCENTILE))
     return level if level > 0 else max(float(image.max()), 1e-30)
 
@@ -181,7 +180,7 @@ def _used_psf(result: Reconstruction, job: Job) -> int:
     return 0 if z_um is None else int(np.argmin(np.abs(job.calibration.source_positions_um[:, 2] - z_um)))
 
 
-def photographed(job: Job) -> npt.NDArray[np.float32]:
+def photographed(job: Job) -> Float32Array:
     """Return the photograph to be shown: a colour mosaic's pixels count for their own colour, a cell each."""
     image, valid = job.measurement, job.valid
     mosaic = None if job.reduction is None else job.reduction.mosaic
@@ -193,11 +192,11 @@ def photographed(job: Job) -> npt.NDArray[np.float32]:
     return np.moveaxis(cells, 0, -1)
 
 
-def _on_screen(image: npt.NDArray[np.float32]) -> npt.NDArray[np.float64]:
+def _on_screen(image: Float32Array) -> Float64Array:
     return as_seen(image) / 255.0
 
 
-def _shown(image: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
+def _shown(image: Float32Array) -> Float32Array:
     return np.maximum(image, 0)
 
 

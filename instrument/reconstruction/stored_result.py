@@ -11,7 +11,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from instrument.files.atomic import protect, refuse_input, whole_file
 from instrument.files.calibration_file import find_calibration, load_calibration, save_calibration
@@ -28,6 +27,7 @@ from instrument.volumes.grid_facts import grid_of
 from instrument.volumes.opening import open_volume
 from instrument.volumes.source import VolumeSource, metric_source
 from instrument.volumes.writing import write_volume_tiff, write_volume_zarr
+from recon.arrays import Float32Array, Float64Array
 from recon.camera.grid import Grid
 from recon.errors import InputError
 from recon.reconstruction.psf_refinement import as_refined
@@ -66,15 +66,15 @@ class StoredResult:
 
     path: Path
     """The image's or volume's file or folder."""
-    image: npt.NDArray[np.float32] | None
+    image: Float32Array | None
     """float32, (height, width) or (height, width, 3): the picture; None for a volume."""
     volume: VolumeSource | None
     """The volume; None for a picture. Close it in the end."""
     record: Mapping[str, Any]
     """What was written beside it; empty for results from elsewhere."""
-    deviation: npt.NDArray[np.float32] | None = None
+    deviation: Float32Array | None = None
     """Standard deviation of a picture's pixels, as it; None where it was not asked for."""
-    residual: npt.NDArray[np.float32] | None = None
+    residual: Float32Array | None = None
     """What is left of the data, in units of their noise; None where a verdict says what it is worth."""
 
     def __repr__(self) -> str:
@@ -140,7 +140,7 @@ class StoredResult:
         return None if value is None else float(value)
 
     @property
-    def planes_um(self) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]] | None:
+    def planes_um(self) -> tuple[Float64Array, Float64Array] | None:
         """Depth and lateral pitch of each plane of a volume, micrometres; None where not known."""
         grid = self.grid
         known = grid is not None and np.isfinite(grid.z_um).all() and np.isfinite(grid.pitch_um).all()
@@ -312,7 +312,7 @@ def open_result(path: Path | str) -> StoredResult:
     return StoredResult(path, np.asarray(pixels, np.float32), None, record, deviation, residual)
 
 
-def _beside(path: Path, name: str | None) -> npt.NDArray[np.float32] | None:
+def _beside(path: Path, name: str | None) -> Float32Array | None:
     """Read what was written beside a picture; None where it is no more."""
     beside = path.with_name(Path(str(name)).name)
     if name is None or not beside.is_file():
@@ -457,7 +457,7 @@ def export_result(
         write_volume_tiff(target, planes, shape, grid)
 
 
-def _planes(source: VolumeSource, advance: Advance | None) -> Iterator[npt.NDArray[np.float32]]:
+def _planes(source: VolumeSource, advance: Advance | None) -> Iterator[Float32Array]:
     n_z = source.shape[0]
     for z in range(n_z):
         yield source.plane(z)
@@ -469,7 +469,7 @@ def _full_shape(source: VolumeSource) -> tuple[int, ...]:
     return source.shape if source.n_channels == 1 else (*source.shape, source.n_channels)
 
 
-def _write_npy(target: Path, planes: Iterator[npt.NDArray[np.float32]], shape: tuple[int, ...]) -> None:
+def _write_npy(target: Path, planes: Iterator[Float32Array], shape: tuple[int, ...]) -> None:
     with whole_file(target) as temporary:
         voxels = np.lib.format.open_memmap(temporary, mode="w+", dtype=np.dtype(np.float32), shape=shape)
         for z, plane in enumerate(planes):

@@ -6,11 +6,11 @@ from dataclasses import replace
 from typing import Any, Literal
 
 import numpy as np
-import numpy.typing as npt
 
 from instrument.files.errors import BenchError, FileError
 from instrument.files.images import ImageFile, read_image
 from instrument.reconstruction.preparation import DarkChoice, dark_from_file
+from recon.arrays import Array
 
 SrgbChoice = Literal["none", "photograph", "psf", "both"]
 _SLOPE, _LINEAR, _OFFSET, _POWER = 12.92, 0.04045, 0.055, 2.4  # IEC 61966-2-1
@@ -69,5 +69,5 @@ def _most(dtype: np.dtype[Any]) -> int:
     return (1 << bits) - 1
 
 
-def _light(coded: npt.NDArray[Any]) -> npt.NDArray[Any]:
+def _light(coded: Array) -> Array:
     return np.where(coded <= _LINEAR, coded / _SLOPE, ((coded + _OFFSET) / (1 + _OFFSET)) ** _POWER)

@@ -37,10 +37,11 @@ from instrument.reconstruction.video_job import VideoJob, VideoPlan
 from instrument.reconstruction.video_work import BlockReport, CancelledError, cluster, in_process, on_cluster
 from instrument.runs.run import Run
 from instrument.runs.run_files import is_run
+from recon.arrays import Float32Array
 from recon.base.declare import inapplicable
 from recon.base.threads import linear_algebra_on_one_thread
 from recon.reconstruction.decoys import check_calibration
-from recon.reconstruction.measurement import Floats, Measurement
+from recon.reconstruction.measurement import Measurement
 from recon.reconstruction.options import ReconstructionOptions
 from recon.reconstruction.problem import Problem
 from recon.solvers.memory import give_back
@@ -114,7 +115,7 @@ def prepare_video(request: VideoRequest, *, force: bool = False) -> PreparedVide
     picture = _first_picture(request, run, frames[0])
     assert picture.reduction is not None
     inputs, options = request.inputs, request.options
-    others: list[Floats] = []
+    others: list[Float32Array] = []
     if options.model == "auto" and request.video.over_time is None:
         at = np.unique(np.linspace(0, len(frames) - 1, LOOKED_AT).round().astype(int))[1:]
         others = [picture.reduction.apply(run.frame(frames[i])) for i in at]

@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import numpy.typing as npt
 
 from drivers.frame import FrameMetadata
 from instrument.files.atomic import whole_folder
@@ -19,6 +18,7 @@ from instrument.files.pieces import piece_bytes, require_pieces
 from instrument.files.reading import MOST_TEXT_BYTES, require_file, require_plausible
 from instrument.runs.run import Run
 from instrument.volumes.grid_facts import grid_facts, grid_of, origin_um, voxel_um
+from recon.arrays import Array, Float32Array
 
 STILL = {"um": 0.5, "mrad": 0.02}
 """How far readings of a stage that stands may lie apart, by the unit that an axis' name ends in.
@@ -86,8 +86,6 @@ if TYPE_CHECKING:
     import zarr
 
     from recon.camera.grid import Grid
-
-Floats = npt.NDArray[np.float32]
 
 
 def create_output(
@@ -204,7 +202,7 @@ class VideoPictures:
         indices = sorted(int(name) for name in names if name.isascii() and name.isdecimal())
         return tuple(index for index in indices if index < len(self) and self.is_written(index))
 
-    def read(self, index: int) -> Floats:
+    def read(self, index: int) -> Float32Array:
         """Return one picture or volume, ([n_z,] height, width[, 3]); NaN where there is none.
 
         Raises FileError when it is damaged.
@@ -218,7 +216,7 @@ class VideoPictures:
             raise FileError(self.path, f"picture {index} cannot be read: {error!s:.200}.") from error
         return np.ascontiguousarray(np.moveaxis(picture, 0, -1)) if "c" in self.axes else picture
 
-    def flat(self, index: int) -> Floats:
+    def flat(self, index: int) -> Float32Array:
         """Return one picture, (height, width[, 3]); of a volume each pixel's light of all depths."""
         picture = self.read(index)
         return picture.sum(axis=0) if "z" in self.axes else picture
@@ -227,7 +225,7 @@ class VideoPictures:
         """Whether a picture is on the disk."""
         return self._file(index).exists()
 
-    def write(self, index: int, picture: Floats) -> None:
+    def write(self, index: int, picture: Float32Array) -> None:
         """Put a picture on the disk, whole or not at all; OSError names the folder."""
         try:
             self.array[index] = np.moveaxis(picture, -1, 0) if "c" in self.axes else picture
@@ -282,7 +280,7 @@ def samples_of(indices: Sequence[int]) -> list[int]:
 BLACK_PERCENTILE, WHITE_PERCENTILE = 0.5, 99.8
 
 
-def levels_of(pictures: Iterable[npt.NDArray[Any]]) -> tuple[float, float]:
+def levels_of(pictures: Iterable[Array]) -> tuple[float, float]:
     """Return black and white for pictures to be shown alike: percentiles over all of them, NaN left out."""
     values = [picture[np.isfinite(picture)][::7] for picture in pictures]
     together = np.concatenate([v for v in values if v.size] or [np.zeros(1)])

@@ -32,6 +32,7 @@ from instrument.files.record import RecordFormat, plain
 from instrument.reconstruction.job import Reduction
 from instrument.reconstruction.mosaic import mosaic_named
 from instrument.reconstruction.preparation import Crop
+from recon.arrays import Array
 from recon.base.declare import record
 from recon.base.noise import NoiseModel
 from recon.camera.camera_model import Extent
@@ -172,7 +173,7 @@ class VideoJob:
 
     # What workers need -----------------------------------------------------------------------------
     @cached_property
-    def _arrays(self) -> dict[str, npt.NDArray[Any]]:
+    def _arrays(self) -> dict[str, Array]:
         with np.load(self.folder / _CAMERA) as file:
             return dict(file)
 

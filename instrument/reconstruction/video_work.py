@@ -31,8 +31,8 @@ from instrument.reconstruction.video_files import VideoPictures
 from instrument.reconstruction.video_job import VideoJob
 from instrument.runs.run import Run
 from instrument.runs.run_files import log_size
+from recon.arrays import Float32Array
 from recon.base.threads import get_threads, linear_algebra_on_one_thread, set_threads
-from recon.reconstruction.measurement import Floats
 from recon.solvers.memory import peak_resident_bytes
 from recon.streams.joint import solve_together
 from recon.streams.stillness import has_light
@@ -113,7 +113,7 @@ def solve_block(
     unlit = 0
     frame_s: list[float] = []
 
-    def measured() -> Iterator[Floats]:
+    def measured() -> Iterator[Float32Array]:
         nonlocal unlit
         reduction, deviation = job.reduction, job.problem.noise
         for index in block:
@@ -124,7 +124,7 @@ def solve_block(
     if together_in is None:
         job, solver = _solver_for(job)
         solver.begin()
-        solved: Iterator[Floats] = map(solver.next, measured())
+        solved: Iterator[Float32Array] = map(solver.next, measured())
     else:
         stack = np.stack(list(measured()))
         together = solve_together(

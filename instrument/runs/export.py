@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 import tifffile
 
 from drivers.frame import FrameMetadata
@@ -24,8 +23,8 @@ from instrument.files.record import plain
 from instrument.runs.frame_facts import z_steps_um
 from instrument.runs.run import Run
 from instrument.runs.run_files import FRAMES, RunError
+from recon.arrays import Array
 
-Image = npt.NDArray[Any]
 _BIG_TIFF_BYTES = 3_900_000_000
 
 
@@ -65,7 +64,7 @@ def export(
     if absent := [index for index in indices if index not in run.records]:
         raise RunError(run.path, f"frame {absent[0]} is not there ({run.condition}).")
 
-    def images() -> Iterator[Image]:
+    def images() -> Iterator[Array]:
         for done, index in enumerate(indices, start=1):
             yield run.frame(index)
             if on_progress is not None:
@@ -75,7 +74,7 @@ def export(
     if target.is_dir() or not target.suffix:
         _png(run, target, indices, images())
         return indices
-    writers: dict[str, Callable[[Run, Path, list[int], Iterator[Image]], None]] = {
+    writers: dict[str, Callable[[Run, Path, list[int], Iterator[Array]], None]] = {
         **dict.fromkeys((".ome.tif", ".ome.tiff"), partial(_tiff, ome=True)),
         **dict.fromkeys((".tif", ".tiff"), partial(_tiff, ome=False)),
         **dict.fromkeys((".h5", ".hdf5"), _hdf5),
@@ -97,7 +96,7 @@ def export(
     return indices
 
 
-def _tiff(run: Run, path: Path, indices: list[int], images: Iterator[Image], *, ome: bool) -> None:
+def _tiff(run: Run, path: Path, indices: list[int], images: Iterator[Array], *, ome: bool) -> None:
     array = run.array
     shape = (len(indices), *array.frame_shape)
     pitch_um = float(run.provenance["pixel_pitch_um"])
@@ -163,7 +162,7 @@ def _told(values: list[Any]) -> Any:
     return values[0] if all(one == values[0] for one in values) else "; ".join(map(str, values))
 
 
-def _hdf5(run: Run, path: Path, indices: list[int], images: Iterator[Image]) -> None:
+def _hdf5(run: Run, path: Path, indices: list[int], images: Iterator[Array]) -> None:
     try:
         import h5py
     except ImportError:
@@ -200,7 +199,7 @@ def _hdf5(run: Run, path: Path, indices: list[int], images: Iterator[Image]) -> 
             file.attrs["plan"] = run.plan.to_json()
 
 
-def _npy(run: Run, path: Path, indices: list[int], images: Iterator[Image]) -> None:
+def _npy(run: Run, path: Path, indices: list[int], images: Iterator[Array]) -> None:
     array = run.array
     shape = (len(indices), *array.frame_shape)
     data = np.lib.format.open_memmap(path, mode="w+", dtype=array.dtype, shape=shape)
@@ -209,7 +208,7 @@ def _npy(run: Run, path: Path, indices: list[int], images: Iterator[Image]) -> N
     data.flush()
 
 
-def _png(run: Run, folder: Path, indices: list[int], images: Iterator[Image]) -> None:
+def _png(run: Run, folder: Path, indices: list[int], images: Iterator[Array]) -> None:
     if run.array.dtype == np.float32:
         raise RunError(run.path, "has averaged frames (float32), which PNG cannot hold. Export to .tif.")
     folder.mkdir(parents=True, exist_ok=True)
@@ -221,7 +220,7 @@ def _png(run: Run, folder: Path, indices: list[int], images: Iterator[Image]) ->
 
 
 def _mp4(
-    run: Run, path: Path, _indices: list[int], images: Iterator[Image], *, frames_per_s: float | None
+    run: Run, path: Path, _indices: list[int], images: Iterator[Array], *, frames_per_s: float | None
 ) -> None:
     if frames_per_s is None:
         frames_per_s = 1 / run.frame_period_s if run.frame_period_s else 10.0

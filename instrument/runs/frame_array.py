@@ -27,8 +27,8 @@ from instrument.files.errors import FileError
 from instrument.files.ome_zarr import ome_attributes
 from instrument.files.reading import parse_json, read_bytes, require_file
 from instrument.runs.log import GONE
+from recon.arrays import Array
 
-Image = npt.NDArray[Any]
 _LEVEL = "0"
 DESCRIPTIONS = f"{_LEVEL}/zarr.json", "zarr.json"
 """Files that describe the array and the image."""
@@ -176,7 +176,7 @@ class FrameArray:
         shutil.rmtree(draft, ignore_errors=True)
         return draft
 
-    def write(self, items: Sequence[tuple[int, Image]]) -> list[StoredChunk]:
+    def write(self, items: Sequence[tuple[int, Array]]) -> list[StoredChunk]:
         """Store frames and return once all of them are on the disk.
 
         Several at a time cost less than one by one, as folders are synced once for all.
@@ -215,7 +215,7 @@ class FrameArray:
         self._sync.folders(folders)
         return [draft.chunk for draft in drafts]
 
-    def read(self, index: int) -> tuple[Image, int]:
+    def read(self, index: int) -> tuple[Array, int]:
         """Return one frame as it is on the disk, and the CRC-32 of its file.
 
         Raises FileNotFoundError when the frame is not there; FileError when its file has the wrong size.
@@ -275,7 +275,7 @@ class FrameArray:
         """Return the file that holds a frame."""
         return self.path / _LEVEL / "c" / str(index) / "/".join("0" * len(self.frame_shape))
 
-    def _write_draft(self, index: int, image: Image) -> _Draft:
+    def _write_draft(self, index: int, image: Array) -> _Draft:
         """Write a frame's bytes beside the place they belong to; not synced yet."""
         planes = np.moveaxis(image, -1, 0) if self.is_colour else image
         data = np.ascontiguousarray(planes, dtype=self.dtype.newbyteorder("<")).data.cast("B")

@@ -7,7 +7,6 @@ from math import isfinite
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from drivers.frame import FrameMetadata
 from instrument.files.ome_zarr import ome_channels
@@ -15,6 +14,7 @@ from instrument.runs.frame_array import description_of, group_of
 from instrument.runs.run import Run
 from instrument.runs.run_files import PROVENANCE, RunError
 from instrument.volumes.grid_facts import EVEN
+from recon.arrays import Float64Array
 
 TOLD = ("pixel_format", "significant_bits", "black_level", "exposure_ms", "gain", "binning", "roi")
 """Of the camera: as one value where it is that of all frames."""
@@ -23,7 +23,7 @@ EVERY = ("exposure_ms", "led_pattern", "slm_image_hash")
 """Of every frame of a plan."""
 
 
-def z_steps_um(noted: Sequence[FrameMetadata]) -> npt.NDArray[np.float64]:
+def z_steps_um(noted: Sequence[FrameMetadata]) -> Float64Array:
     """Return the steps of a sweep along z alone, which goes one way; nothing for other frames."""
     places = [one.stage_position for one in noted]
     others = {tuple(v for name, v in place.items() if name != "z_um") for place in places}

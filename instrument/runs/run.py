@@ -13,7 +13,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import numpy.typing as npt
 
 from drivers.frame import FrameMetadata
 from drivers.registry.claim import is_locked
@@ -37,6 +36,7 @@ from instrument.runs.run_files import (
     is_run,
     log_size,
 )
+from recon.arrays import Array
 
 if TYPE_CHECKING:
     import zarr
@@ -346,7 +346,7 @@ class Run:
 
         return zarr.open_array(self.path / FRAMES / "0", mode="r", zarr_format=3)
 
-    def frame(self, index: int | Step) -> npt.NDArray[Any]:
+    def frame(self, index: int | Step) -> Array:
         """Return one stored frame, ``(height, width)`` or ``(height, width, 3)``.
 
         Raises RunError when it was not stored, or its checksum is not that of what was stored.
@@ -374,7 +374,7 @@ class Run:
             raise RunError(self.path, "is a recording; it has no plan.")
         return [step for step in self.plan.steps() if label in (None, step.label)]
 
-    def images(self, label: str) -> npt.NDArray[Any]:
+    def images(self, label: str) -> Array:
         """Return the frames of all steps of one label, stacked along the first axis.
 
         Raises RunError when there are none, or one was not stored.

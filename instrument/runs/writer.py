@@ -19,7 +19,6 @@ from pathlib import Path
 from typing import Any, Self
 
 import numpy as np
-import numpy.typing as npt
 
 from drivers.frame import FrameMetadata
 from drivers.registry.claim import lock
@@ -57,6 +56,7 @@ from instrument.runs.run_files import (
     refuse_within,
     slm_image_name,
 )
+from recon.arrays import Array
 
 _PACKAGES = ("diffuserbench", "numpy", "scipy", "opencv-python-headless", "pydantic")
 
@@ -126,7 +126,7 @@ class FrameToStore:
     """A frame on its way to the disk."""
 
     index: int
-    image: npt.NDArray[Any]
+    image: Array
     metadata: FrameMetadata
     average: int = 1
 

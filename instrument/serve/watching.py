@@ -17,6 +17,7 @@ from drivers.frame import Frame
 from instrument.files.errors import BenchError, percent
 from instrument.live.frame_view import SATURATED, fill_indices, histogram, index_table, percentiles
 from instrument.serve.operation import WATCHER, Operation
+from recon.arrays import Array
 
 _log = logging.getLogger(__name__)
 _WIDEST = 1024
@@ -124,7 +125,7 @@ def picture(frame: Frame) -> tuple[dict[str, Any], bytes]:
     return said, encoded.tobytes()
 
 
-def _indices(channel: npt.NDArray[Any], table: npt.NDArray[np.uint8], step: int) -> npt.NDArray[np.uint8]:
+def _indices(channel: Array, table: npt.NDArray[np.uint8], step: int) -> npt.NDArray[np.uint8]:
     out = np.empty((channel.shape[0] // step, channel.shape[1] // step), np.uint8)
     fill_indices(np.ascontiguousarray(channel), table, step, out)
     return out

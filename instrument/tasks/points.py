@@ -7,13 +7,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
-import numpy.typing as npt
 
 from instrument.files.atomic import require_new, write_text
 from instrument.files.errors import BenchError, FileError, count, ranges
 from instrument.reconstruction.film import Film, is_film
 from instrument.tasks.task import Desk, Done, task
 from recon.analysis.point_places import PointOptions, PointPlaces, point_places
+from recon.arrays import Float32Array
 from recon.base.declare import option
 from recon.errors import InputError
 
@@ -191,7 +191,7 @@ def _of_film(desk: Desk, files: PointFiles, options: PointOptions) -> Done:
     return Done((files.out,))
 
 
-def _brightest(volume: npt.NDArray[np.float32]) -> float:
+def _brightest(volume: Float32Array) -> float:
     """Return the light of the brightest voxel, of all channels together."""
     grey = volume.sum(axis=3) if volume.ndim == 4 else volume
     return float(np.max(grey, where=~np.isnan(grey), initial=0.0))

@@ -6,7 +6,8 @@ from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import numpy.typing as npt
+
+from recon.arrays import Float64Array
 
 if TYPE_CHECKING:
     from recon.camera.grid import Grid
@@ -17,7 +18,7 @@ EVEN = 0.01
 """Steps that differ by less than this part of the smallest are taken for even."""
 
 
-def middle_step_um(z_um: npt.NDArray[np.float64]) -> float:
+def middle_step_um(z_um: Float64Array) -> float:
     """Return the step beside the middle plane, positive: what OME files get; NaN where it is not known."""
     if len(z_um) < 2:
         return float("nan")
@@ -25,7 +26,7 @@ def middle_step_um(z_um: npt.NDArray[np.float64]) -> float:
     return abs(float(z_um[middle + 1] - z_um[middle]))
 
 
-def uneven_steps(z_um: npt.NDArray[np.float64]) -> str:
+def uneven_steps(z_um: Float64Array) -> str:
     """Say that planes are not evenly spaced, and which step an OME file has; empty where they are.
 
     ``z_um``, (n_z,), are the planes' depths, ascending or descending; not finite where they are not known.
@@ -109,7 +110,7 @@ def grid_of(facts: Mapping[str, Any], shape: tuple[int, int, int]) -> Grid:
     return Grid(shape, (row, column), z_um, pitch_um, None, axis_um, facts.get("upright") is True, made_of_um)
 
 
-def numbers(value: Any, shape: tuple[int, ...]) -> npt.NDArray[np.float64] | None:
+def numbers(value: Any, shape: tuple[int, ...]) -> Float64Array | None:
     """Return numbers of a shape, () for one; None where a record has something else, or what is no size."""
     try:
         numbers = np.array(value, np.float64)
@@ -118,6 +119,6 @@ def numbers(value: Any, shape: tuple[int, ...]) -> npt.NDArray[np.float64] | Non
     return numbers if numbers.shape == shape and (np.abs(numbers) < _BEYOND).all() else None
 
 
-def known(values: npt.NDArray[np.float64]) -> list[float] | None:
+def known(values: Float64Array) -> list[float] | None:
     """Return numbers as JSON can hold them; None where one of them is not known."""
     return [float(v) for v in values] if np.isfinite(values).all() else None

@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from instrument.files.errors import FileError
 from instrument.files.ome_tiff import tiff_facts
@@ -16,6 +15,7 @@ from instrument.files.pieces import piece_bytes
 from instrument.files.reading import folder_bytes, require_file, require_plausible, stored_bytes
 from instrument.files.tiff_pages import open_tiff
 from instrument.volumes.source import VolumeSource, volume_in_memory
+from recon.arrays import Array
 
 
 def open_volume(path: Path | str) -> VolumeSource:
@@ -62,7 +62,7 @@ def _open_zarr(path: Path) -> VolumeSource:
         found = ", ".join(map(str, names))
         raise FileError(path, f"has the axes {found}; a volume has z, y, x, or c before them.")
 
-    def reader(array: Any) -> Callable[[Any, Any, Any], npt.NDArray[Any]]:
+    def reader(array: Any) -> Callable[[Any, Any, Any], Array]:
         if len(names) == 3:
             return lambda z, y, x: np.asarray(array[z, y, x])[..., None]
         return lambda z, y, x: np.moveaxis(np.asarray(array[:, z, y, x]), 0, -1)
@@ -122,7 +122,7 @@ def _open_tiff(path: Path) -> VolumeSource:
         return volume_in_memory(np.moveaxis(mapped, 1, -1) if axes == "ZCYX" else mapped, path, facts)
     per_plane = shape.get("C", 1) if axes == "ZCYX" else 1
 
-    def read(z: Any, y: Any, x: Any) -> npt.NDArray[Any]:
+    def read(z: Any, y: Any, x: Any) -> Array:
         numbers = [z] if isinstance(z, int) else list(range(*z.indices(shape["Z"])))
         planes = []
         for number in numbers:

@@ -8,15 +8,15 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import numpy.typing as npt
 
 from instrument.files.errors import FileError
 from instrument.volumes.grid_facts import grid_facts
+from recon.arrays import Array, Float32Array
 
 if TYPE_CHECKING:
     from recon.camera.grid import Grid
 
-Plane = npt.NDArray[np.float32]
+Plane = Float32Array
 _SIDE_PIXELS = 1 << 20
 """Slices along depth are read from the finest level whose planes are no larger: each touches every plane."""
 
@@ -42,7 +42,7 @@ class VolumeSource:
     def __init__(
         self,
         path: Path,
-        levels: list[Callable[[Any, Any, Any], npt.NDArray[Any]]],
+        levels: list[Callable[[Any, Any, Any], Array]],
         shapes: list[tuple[int, int, int]],
         n_channels: int,
         close: Callable[[], object] | None = None,
@@ -92,7 +92,7 @@ class VolumeSource:
                 return level
         return len(self._shapes) - 1
 
-    def _read(self, read: Callable[[Any, Any, Any], npt.NDArray[Any]], z: Any, y: Any, x: Any) -> Plane:
+    def _read(self, read: Callable[[Any, Any, Any], Array], z: Any, y: Any, x: Any) -> Plane:
         try:
             with self._lock:
                 voxels = np.asarray(read(z, y, x), np.float32)
@@ -103,9 +103,7 @@ class VolumeSource:
         return voxels[..., 0] if self.n_channels == 1 else voxels
 
 
-def volume_in_memory(
-    voxels: npt.NDArray[Any], path: Path, facts: Mapping[str, Any] | None = None
-) -> VolumeSource:
+def volume_in_memory(voxels: Array, path: Path, facts: Mapping[str, Any] | None = None) -> VolumeSource:
     """Return a source of an array, (n_z, height, width) or (n_z, height, width, n_channels).
 
     ``path`` is what messages call it, ``facts`` as :class:`VolumeSource`. The array may be a memory map.
@@ -136,9 +134,9 @@ def metric_source(source: VolumeSource, grid: Grid, voxel_um: float | None = Non
     metric = metric_grid(grid, voxel_um)
     made = metric_planes(source.plane, grid, metric)
 
-    def read(z: Any, y: Any, x: Any) -> npt.NDArray[Any]:
+    def read(z: Any, y: Any, x: Any) -> Array:
         if isinstance(z, int):
-            plane: npt.NDArray[Any] = made(z)
+            plane: Array = made(z)
             return plane[y, x] if plane.ndim == 3 else plane[y, x, None]
         return np.stack([read(k, y, x) for k in range(*z.indices(metric.shape[0]))])
 

@@ -7,12 +7,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import numpy.typing as npt
 
 from instrument.files.atomic import whole_file, whole_folder
 from instrument.files.ome_tiff import annotation, ome_tiff_channels, resolution
 from instrument.files.ome_zarr import ome_attributes, ome_channels, stem_of
 from instrument.volumes.grid_facts import EVEN, grid_facts, origin_um, scale_in_words, voxel_um
+from recon.arrays import Float32Array, Float64Array
 
 if TYPE_CHECKING:
     from recon.camera.grid import Grid
@@ -24,7 +24,7 @@ _SMALLEST_LEVEL = 128
 
 def write_volume_zarr(
     path: Path,
-    planes: Iterable[npt.NDArray[np.float32]],
+    planes: Iterable[Float32Array],
     shape: tuple[int, ...],
     grid: Grid,
     attributes: dict[str, Any],
@@ -93,17 +93,15 @@ def write_volume_zarr(
         group.attrs["diffuserbench"] = attributes | {"words": scale_in_words(grid)} | grid_facts(grid)
 
 
-def _halved(pixels: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
+def _halved(pixels: Float32Array) -> Float32Array:
     """Return the mean of 2 x 2 pixels."""
     height, width = (n // 2 for n in pixels.shape[-2:])
     blocks = pixels[..., : 2 * height, : 2 * width].reshape(*pixels.shape[:-2], height, 2, width, 2)
-    means: npt.NDArray[np.float32] = blocks.mean(axis=(-3, -1), dtype=np.float32)
+    means: Float32Array = blocks.mean(axis=(-3, -1), dtype=np.float32)
     return means
 
 
-def write_volume_tiff(
-    path: Path, planes: Iterable[npt.NDArray[np.float32]], shape: tuple[int, ...], grid: Grid
-) -> None:
+def write_volume_tiff(path: Path, planes: Iterable[Float32Array], shape: tuple[int, ...], grid: Grid) -> None:
     """Write a volume as OME-TIFF, ``ZYX`` or ``ZCYX``, whole or not at all, with one plane in memory.
 
     ``planes`` are (height, width) or (height, width, n_channels), ``shape`` is that of all with n_z in front.
@@ -116,10 +114,10 @@ def write_volume_tiff(
 
 def write_film_tiff(
     path: Path,
-    pictures: Iterable[npt.NDArray[np.float32]],
+    pictures: Iterable[Float32Array],
     shape: tuple[int, ...],
     grid: Grid | None,
-    times_s: npt.NDArray[np.float64] | None,
+    times_s: Float64Array | None,
     facts: Mapping[str, Any],
 ) -> None:
     """Write a film as OME-TIFF, ``T``, ``Z`` where it is of volumes, ``C`` where in colour, ``YX``.
@@ -145,12 +143,12 @@ def write_film_tiff(
 
 def _write_tiff(
     path: Path,
-    planes: Iterable[npt.NDArray[np.float32]],
+    planes: Iterable[Float32Array],
     shape: tuple[int, ...],
     grid: Grid | None,
     facts: Mapping[str, Any],
     count: int | None = None,
-    times_s: npt.NDArray[np.float64] | None = None,
+    times_s: Float64Array | None = None,
 ) -> None:
     """Write ``count`` volumes of a shape with n_z in front, one after the other; None: one, without T."""
     import tifffile

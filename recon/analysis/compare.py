@@ -9,13 +9,12 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from recon.analysis.pattern_change import PARTS, Change, compare_psfs
 from recon.analysis.what_moved import Explanation, Seen, moved_across, moved_along, seen_px, unseen
+from recon.arrays import Array
 from recon.base.blocks import block_mean
 from recon.base.checks import require_calibration
 from recon.camera.depth_mixture import central_psfs
@@ -23,8 +22,6 @@ from recon.camera.grid import depth_in_words
 from recon.camera.refocus import psf_at
 from recon.errors import InputError
 from recon.types import Calibration, Geometry
-
-Array = npt.NDArray[Any]
 
 WIDER = 1.1
 """Spot that the old PSF makes of the new camera's light, over the sharpest: above this, calibrate again."""

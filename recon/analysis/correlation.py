@@ -8,19 +8,15 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache
-from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
+from recon.arrays import Array, Float64Array
 from recon.base import fft
 from recon.camera.camera_model import members_of_depths
 from recon.camera.registration import register
 from recon.errors import InputError
 from recon.types import Calibration
-
-Array = npt.NDArray[Any]
-Floats = npt.NDArray[np.float64]
 
 RESOLUTION_LEVEL = 0.7
 """Autocorrelation at which two directions are told apart by most sensors (Kuo 2020, sec. 3.2)."""
@@ -44,7 +40,7 @@ def similarity(first: Array, second: Array) -> float:
 class Correlation:
     """Inner products of two images at every shift in whole pixels."""
 
-    values: Floats
+    values: Float64Array
     """(2 height - 1, 2 width - 1): divided by both norms: 1 is identity. The middle is no shift."""
 
     @property
@@ -59,7 +55,7 @@ class Correlation:
         """The largest inner product at any shift."""
         return float(self.values.max())
 
-    def profile(self, axis: int) -> Floats:
+    def profile(self, axis: int) -> Float64Array:
         """Cut through the peak along ``axis`` (0: rows, 1: columns)."""
         row, column = (p + n // 2 for p, n in zip(self.peak, self.values.shape, strict=True))
         return self.values[:, column] if axis == 0 else self.values[row]
@@ -97,7 +93,7 @@ def autocorrelate(psf: Array) -> Correlation:
     return correlate(psf, psf)
 
 
-def autocorrelation_cut(psf: Array, axis: int) -> Floats:
+def autocorrelation_cut(psf: Array, axis: int) -> Float64Array:
     """Return what ``autocorrelate(psf).profile(axis)`` does, from transforms of single lines."""
     lines = np.asarray(psf if axis == 1 else psf.T, np.float64)
     length = lines.shape[1]
@@ -111,7 +107,7 @@ def autocorrelation_cut(psf: Array, axis: int) -> Floats:
     return np.asarray(cut[np.arange(1 - length, length)] / (cut[0] or 1.0))
 
 
-def half_width(cut: Floats, level: float) -> float:
+def half_width(cut: Float64Array, level: float) -> float:
     """Return how far from its peak a cut through a correlation falls to ``level`` of it, pixels.
 
     Linear between pixels, mean of both sides; infinite where it never falls so low.
@@ -194,7 +190,7 @@ def centre_of_light(psf: Array) -> tuple[float, float]:
     return row, column
 
 
-def _crossing(cut: Floats, level: float) -> float:
+def _crossing(cut: Float64Array, level: float) -> float:
     below = np.flatnonzero(cut < level)
     if not below.size:
         return float("inf")

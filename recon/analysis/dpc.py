@@ -23,10 +23,8 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
+from recon.arrays import Float32Array, Float64Array
 from recon.errors import InputError
-
-Floats = npt.NDArray[np.float64]
-Image = npt.NDArray[np.float32]
 
 SIDES = ("left", "right", "top", "bottom")
 _ALIKE = 3.0
@@ -68,7 +66,7 @@ which the pupil hardly passes, from drowning in noise; what is ten times as coar
 loses 0.06 %."""
 
 
-def phase_from_halves(halves: Mapping[str, npt.ArrayLike], optics: DpcOptics) -> Image:
+def phase_from_halves(halves: Mapping[str, npt.ArrayLike], optics: DpcOptics) -> Float32Array:
     """Return the phase of a thin sample in radians, float32 (height, width), mean and mean slope zero.
 
     Halves of unequal brightness look like a sample tilted up to its edges: each is brought to its opposite's
@@ -108,7 +106,7 @@ def phase_from_halves(halves: Mapping[str, npt.ArrayLike], optics: DpcOptics) ->
     return np.asarray(level(phase), np.float32)
 
 
-def level(surface: npt.ArrayLike) -> Floats:
+def level(surface: npt.ArrayLike) -> Float64Array:
     """Return a surface less the plane that fits it best."""
     values = np.asarray(surface, np.float64)
     y, x = (np.linspace(-1, 1, n) if n > 1 else np.zeros(1) for n in values.shape)
@@ -144,13 +142,13 @@ def transfer(shape: tuple[int, int], optics: DpcOptics, *, axis: int) -> npt.NDA
     return np.asarray(1j * total / (optics.lit_share * np.pi * radius**2), np.complex128)
 
 
-def slopes_deg(height_um: Image, pitch_um: float) -> Floats:
+def slopes_deg(height_um: Float32Array, pitch_um: float) -> Float64Array:
     """Return the magnitude of a surface's slope, degrees, (height, width)."""
     dy, dx = np.gradient(np.asarray(height_um, np.float64), pitch_um)
     return np.asarray(np.rad2deg(np.arctan(np.hypot(dy, dx))))
 
 
-def deflections_deg(slope_deg: Floats, index: float) -> Floats:
+def deflections_deg(slope_deg: Float64Array, index: float) -> Float64Array:
     """Return by how much a surface of that slope deflects a ray at normal incidence into air, degrees.
 
     Snell's law at the textured exit: ``asin(n sin(slope)) - slope``.
@@ -159,7 +157,7 @@ def deflections_deg(slope_deg: Floats, index: float) -> Floats:
     return np.asarray(np.rad2deg(np.arcsin(np.minimum(index * np.sin(slope), 1.0)) - slope))
 
 
-def _contrast(images: Mapping[str, Floats], one: str, opposite: str) -> Floats:
+def _contrast(images: Mapping[str, Float64Array], one: str, opposite: str) -> Float64Array:
     first, second = images[one], images[opposite]
     total = first + second
     if not (total.mean() > 0 and (total > 0).mean() > 0.99):
@@ -178,7 +176,7 @@ def _contrast(images: Mapping[str, Floats], one: str, opposite: str) -> Floats:
     return np.asarray(contrast)
 
 
-def _mirrored(image: Floats, *, odd_axis: int) -> Floats:
+def _mirrored(image: Float64Array, *, odd_axis: int) -> Float64Array:
     """Extend to twice the size: odd along one axis, even along the other."""
     for axis in (0, 1):
         mirror = np.flip(image, axis)

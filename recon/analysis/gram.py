@@ -16,17 +16,15 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import product
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
-import numpy.typing as npt
 
+from recon.arrays import Array, BoolArray, Float32Array, Float64Array
 from recon.base import fft
 from recon.errors import InputError
 
-Array = npt.NDArray[Any]
-Floats = npt.NDArray[np.float64]
-Single = npt.NDArray[np.float32]
+Single = Float32Array
 Direction = Literal["x", "z", "xz"]
 
 WORST = 1e7
@@ -77,7 +75,7 @@ def _sides(direction: Direction, count: int) -> tuple[int, int]:
     return {"x": (1, count), "z": (count, 1), "xz": (side, side)}[direction]
 
 
-def gram_matrix(planes: Array, voxels: Sequence[Voxel]) -> Floats:
+def gram_matrix(planes: Array, voxels: Sequence[Voxel]) -> Float64Array:
     """Inner products of the columns of voxels: each plane's PSF, shifted, and cropped to the sensor.
 
     Parameters
@@ -100,7 +98,7 @@ def gram_matrix(planes: Array, voxels: Sequence[Voxel]) -> Floats:
     return gram
 
 
-def condition_number(gram: Floats) -> float:
+def condition_number(gram: Float64Array) -> float:
     """Condition number of the columns with this Gram matrix, each column divided by its norm.
 
     Infinite where a column is zero or the columns are dependent as far as double precision tells.
@@ -227,7 +225,7 @@ class WindowProblem:
             asking = target - self._normal(x)
         return np.asarray(x / self._norms[:, None, None], np.float32)
 
-    def _fit(self, x: Floats, lit: npt.NDArray[np.bool_], target: Floats) -> None:
+    def _fit(self, x: Float64Array, lit: BoolArray, target: Float64Array) -> None:
         """Bring ``x`` to the least squares of the lit voxels; those that would be negative go dark."""
         from scipy.linalg import solve  # late, as above
 
@@ -249,7 +247,7 @@ class WindowProblem:
             x[lit] = wanted
             return
 
-    def _normal(self, x: Floats) -> Floats:
+    def _normal(self, x: Float64Array) -> Float64Array:
         """``A^T A x`` in the window."""
         seen = np.zeros_like(x)
         rows, columns = (2 * h + 1 for h in self.half)
@@ -258,7 +256,7 @@ class WindowProblem:
             seen += x[k, r, c] * self._products[:, k, down : down + rows, right : right + columns]
         return seen
 
-    def _correlations(self, reach: tuple[int, int]) -> Floats:
+    def _correlations(self, reach: tuple[int, int]) -> Float64Array:
         """Return the inner products of planes ``j`` and ``k`` shifted against one another, (j, k, r, c)."""
         shape = 2 * reach[0] + 1, 2 * reach[1] + 1
         products = np.empty((self.n_z, self.n_z, *shape))

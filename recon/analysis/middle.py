@@ -9,18 +9,15 @@ must lie to change the middle as much as they change the whole (:attr:`Middle.sp
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from recon.analysis.point_noise import Noise
 from recon.analysis.resolution import axial_resolution
+from recon.arrays import Array
 from recon.camera.depth_mixture import central_psfs
 from recon.camera.refocus import psf_at
 from recon.types import Calibration
-
-Array = npt.NDArray[Any]
 
 LARGEST_PX = 80_000
 """Of larger sensors the middle is taken."""

@@ -10,16 +10,14 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from recon.analysis.correlation import correlate, cut_to_light, lit_extent, similarity, spot_px
+from recon.arrays import Array, Float32Array
 from recon.camera.registration import register
 from recon.camera.transformed import geometric_centre, resampled
-
-Array = npt.NDArray[Any]
 
 BLOCKS = 4
 """Blocks along each side of the pattern."""
@@ -148,7 +146,7 @@ def _block_displacements(
     return np.array(places, np.complex128), np.array(displacements, np.complex128)
 
 
-def _undone(image: Array, factor: complex, shift: complex) -> npt.NDArray[np.float32]:
+def _undone(image: Array, factor: complex, shift: complex) -> Float32Array:
     """Return ``image(factor p + shift)``: cubic splines, zero beyond the border."""
     # (r + i c)(a + i b) = (a r - b c) + i (b r + a c)
     matrix = np.array([[factor.real, -factor.imag], [factor.imag, factor.real]])

@@ -3,15 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
+from recon.arrays import Array, Float64Array
 from recon.base import fft
-
-Array = npt.NDArray[Any]
-Floats = npt.NDArray[np.float64]
 
 PointImage = Callable[[float, float], Array]
 """Image (height, width) of one point ``columns`` sensor pixels off the axis at a place ``s`` on the depth
@@ -23,7 +19,7 @@ HALF_WINDOW = (4, 24)
 _PARTS = 2  # of a plane, at which points' PSFs are made: between two of them 0.3 % of the light is blurred
 
 
-def planes_about(z_um: float, step_per_um: float, count: int = PLANES) -> Floats:
+def planes_about(z_um: float, step_per_um: float, count: int = PLANES) -> Float64Array:
     """Return ``1 / z`` of planes half an axial step apart about a depth, the nearest first."""
     return np.asarray(1 / z_um - step_per_um / 2 * (np.arange(count) - count // 2), np.float64)
 
@@ -31,7 +27,9 @@ def planes_about(z_um: float, step_per_um: float, count: int = PLANES) -> Floats
 class ShiftedPoints:
     """Images (height, width) of points: PSFs between planes, shifted between pixels by a linear phase."""
 
-    def __init__(self, psf_at: Callable[[float], Array], inverse: Floats, shape: tuple[int, ...]) -> None:
+    def __init__(
+        self, psf_at: Callable[[float], Array], inverse: Float64Array, shape: tuple[int, ...]
+    ) -> None:
         self._psf_at, self._inverse, self._light = psf_at, inverse, shape
         self._spectra: dict[int, Array] = {}
         # Room on both sides for the shift, which otherwise would wrap around.

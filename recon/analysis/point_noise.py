@@ -7,12 +7,9 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
+from recon.arrays import Array, Float64Array
 from recon.base.declare import option
-
-Array = npt.NDArray[Any]
-Floats = npt.NDArray[np.float64]
 
 USUAL_ELECTRONS, USUAL_READ_E = 10_000.0, 2.0
 """Of a photograph whose noise nobody knows."""
@@ -27,7 +24,7 @@ class Noise:
     read_e: float = USUAL_READ_E
     """Read noise, electrons."""
 
-    def expose(self, light: Array, rng: np.random.Generator) -> Floats:
+    def expose(self, light: Array, rng: np.random.Generator) -> Float64Array:
         """Return one exposure of an image, in the image's units."""
         scale = self.electrons / float(light.max())
         charge = rng.poisson(np.maximum(light, 0) * scale) + rng.normal(0.0, self.read_e, light.shape)

@@ -11,18 +11,17 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from functools import lru_cache
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from recon.analysis.whole_steps import in_whole_steps
+from recon.arrays import Array, BoolArray, Float32Array, Float64Array
 from recon.base.declare import option
 from recon.camera.grid import Grid, plane_of
 from recon.errors import InputError
 
-Floats = npt.NDArray[np.float64]
-Plane = npt.NDArray[np.float32]
+Plane = Float32Array
 Whole = npt.NDArray[np.intp]
 Voxel = tuple[int, int, int]
 
@@ -78,11 +77,11 @@ class PointPlaces:
         What they leave of it beyond its noise, relative to what is seen of them, root mean square.
     """
 
-    places_um: Floats
-    deviations_um: Floats
-    voxels: Floats
-    light: Floats
-    at_end: npt.NDArray[np.bool_]
+    places_um: Float64Array
+    deviations_um: Float64Array
+    voxels: Float64Array
+    light: Float64Array
+    at_end: BoolArray
     misfit: float | None = None
     unexplained: float | None = None
 
@@ -99,7 +98,7 @@ class PointPlaces:
 
 
 def point_places(
-    volume: npt.NDArray[Any] | Callable[[int], npt.NDArray[Any]],
+    volume: Array | Callable[[int], Array],
     grid: Grid,
     options: PointOptions | None = None,
     on_progress: Callable[[float], object] | None = None,
@@ -157,7 +156,7 @@ def point_places(
     return PointPlaces(places, off, voxels, np.array([found[k][3] for k in order]), ends)
 
 
-def _light(plane: npt.NDArray[Any]) -> Plane:
+def _light(plane: Array) -> Plane:
     """Return a plane without its channels and what is below 0."""
     voxels = np.asarray(plane, np.float32)
     grey = voxels.sum(axis=2) if voxels.ndim == 3 else voxels
@@ -244,7 +243,7 @@ class _Search:
         further = self.grid.z_um[z] / depth
         return self.grid.pixel_of(z, x * further, y * further)
 
-    def point(self, voxel: Voxel) -> tuple[Floats, Floats, Floats, float]:
+    def point(self, voxel: Voxel) -> tuple[Float64Array, Float64Array, Float64Array, float]:
         """Return place, deviations, centre in voxels, and light, of the point that is brightest there."""
         light, at = self._light_of(voxel)
         total = float(light.sum())
@@ -256,7 +255,7 @@ class _Search:
         across = np.hypot([off_column * pitch, off_row * pitch], slopes * off_z)
         return place, np.append(across, off_z), centre, total
 
-    def _light_of(self, voxel: Voxel) -> tuple[Floats, Whole]:
+    def _light_of(self, voxel: Voxel) -> tuple[Float64Array, Whole]:
         """Return light and (plane, row, column) of the voxels about a ray that are nearest to this point."""
         count, *size = self.grid.shape
         others = [other for other in self._near(voxel, 2 * REACH, BESIDE) if other != voxel]
@@ -275,12 +274,12 @@ class _Search:
             voxels.append(np.stack([np.full(rows.size, z), rows, columns], axis=1)[nearest])
         return np.concatenate(light).astype(np.float64), np.concatenate(voxels)
 
-    def _distance(self, point: Voxel, z: int, rows: Whole, columns: Whole) -> Floats:
+    def _distance(self, point: Voxel, z: int, rows: Whole, columns: Whole) -> Float64Array:
         """Return how far voxels of a plane are from a point, in planes and pixels from its ray, squared."""
         row, column = self._on_ray(point, z)
         return np.asarray((z - point[0]) ** 2 + (rows - row) ** 2 + (columns - column) ** 2)
 
-    def _centre(self, share: Floats, at: Whole) -> tuple[Floats, Floats, Floats]:
+    def _centre(self, share: Float64Array, at: Whole) -> tuple[Float64Array, Float64Array, Float64Array]:
         """Return the centre of light in the scene and in voxels, and each voxel's distance from it in voxels.
 
         ``share`` of the light has each voxel, (n,), of those ``at`` plane, row and column, (n, 3).
@@ -298,7 +297,7 @@ class _Search:
         return place, centre, beside
 
 
-def voxels_of(places_um: Floats, grid: Grid) -> Floats:
+def voxels_of(places_um: Float64Array, grid: Grid) -> Float64Array:
     """Return ``(plane, row, column)`` of places in a grid, (n, 3): between planes on the ray through both.
 
     Beyond the outermost planes numbers go on: -0.2 is a fifth of a plane before the first.
@@ -312,7 +311,7 @@ def voxels_of(places_um: Floats, grid: Grid) -> Floats:
     return voxels
 
 
-def _plateaus(peaks: npt.NDArray[np.bool_]) -> tuple[Whole, Whole]:
+def _plateaus(peaks: BoolArray) -> tuple[Whole, Whole]:
     """Return row and column of the voxel in the middle of each connected part; the last where two are."""
     from scipy.ndimage import label
 

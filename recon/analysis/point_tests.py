@@ -5,18 +5,15 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from itertools import count
-from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from recon.analysis.gram import WindowProblem
 from recon.analysis.point_images import HALF_WINDOW, PointImage, ShiftedPoints, planes_about
 from recon.analysis.point_noise import Noise
 from recon.analysis.points import PointGrid, PointTrial, try_points
 from recon.analysis.stated_distance import DRAWS, ROUNDS, smallest_told
-
-Array = npt.NDArray[Any]
+from recon.arrays import Array
 
 
 @dataclass(frozen=True)

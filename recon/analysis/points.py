@@ -14,9 +14,8 @@ import numpy.typing as npt
 from recon.analysis.gram import WindowProblem
 from recon.analysis.point_images import PointImage, ShiftedPoints
 from recon.analysis.point_noise import Noise
+from recon.arrays import Float64Array
 from recon.errors import InputError
-
-Floats = npt.NDArray[np.float64]
 
 DIP = 0.2
 """Dip between two points that counts as resolved (the Rayleigh criterion's)."""
@@ -33,7 +32,7 @@ class PointTrial:
     """``separation_px`` and ``separation_planes``: between neighbours."""
     dip: float
     """The smallest dip between any two neighbours, of all draws."""
-    map: Floats
+    map: Float64Array
     """(n_z, width): the reconstruction of the last draw, summed over rows."""
 
     @property
@@ -85,7 +84,7 @@ def try_points(
     return PointTrial(grid.separation_px, grid.separation_planes, min(dips), seen)
 
 
-def smallest_dip(seen: Floats, places: Floats) -> float:
+def smallest_dip(seen: Float64Array, places: Float64Array) -> float:
     """Return the smallest dip between neighbours of a grid of points.
 
     Parameters
@@ -113,7 +112,7 @@ def smallest_dip(seen: Floats, places: Floats) -> float:
     )
 
 
-def _peak(seen: Floats, place: Floats, reach_z: float, reach_x: float) -> tuple[int, int]:
+def _peak(seen: Float64Array, place: Float64Array, reach_z: float, reach_x: float) -> tuple[int, int]:
     (z, x), (n_z, width) = place, seen.shape
     rows = slice(max(int(np.ceil(z - reach_z)), 0), min(int(np.floor(z + reach_z)), n_z - 1) + 1)
     columns = slice(max(int(np.ceil(x - reach_x)), 0), min(int(np.floor(x + reach_x)), width - 1) + 1)
@@ -122,7 +121,7 @@ def _peak(seen: Floats, place: Floats, reach_z: float, reach_x: float) -> tuple[
     return int(row) + rows.start, int(column) + columns.start
 
 
-def _dip(seen: Floats, first: npt.NDArray[np.int_], second: npt.NDArray[np.int_]) -> float:
+def _dip(seen: Float64Array, first: npt.NDArray[np.int_], second: npt.NDArray[np.int_]) -> float:
     steps = int(np.abs(second - first).max())
     lower = min(float(seen[tuple(first)]), float(seen[tuple(second)]))
     if steps < 2 or lower <= 0:

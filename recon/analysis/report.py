@@ -8,7 +8,6 @@ from functools import cache
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from recon.analysis.correlation import (
     INNER_PRODUCT,
@@ -39,6 +38,7 @@ from recon.analysis.resolution import (
 )
 from recon.analysis.settings import AnalysisSettings, axial_spacing, lateral_spacing, response_of
 from recon.analysis.stated_distance import AT_NEARER, InVolumes, Reached
+from recon.arrays import Array, Float64Array
 from recon.base.arguments import require_argument
 from recon.base.brief import brief
 from recon.base.checks import require_calibration
@@ -49,8 +49,6 @@ from recon.camera.depth_mixture import central_psfs
 from recon.errors import InputError
 from recon.types import Calibration
 
-Array = npt.NDArray[Any]
-Floats = npt.NDArray[np.float64]
 Progress = Callable[[str, float], object]
 """Called with what is being done and the share that is done."""
 
@@ -78,7 +76,7 @@ class Analysis:
     psf: Array
     """(height, width): the central PSF at ``z_um``, as it was analysed (cut to its light, channels
     averaged)."""
-    autocorrelation: Floats
+    autocorrelation: Float64Array
     """Its cut along the columns, from the peak."""
     support_px: tuple[float, float]
     lateral: LateralResolution
@@ -296,7 +294,7 @@ def analyse(
     )
 
 
-def _depth_to_analyse(depths: Floats, step_per_um: Callable[[int], float], notes: list[str]) -> float:
+def _depth_to_analyse(depths: Float64Array, step_per_um: Callable[[int], float], notes: list[str]) -> float:
     """Return the calibrated depth nearest to the middle in 1/z, or a nearer one where depth can be tested.
 
     What lies between two depths is a blend of their PSFs, which is a little blurred. Far away the planes of

@@ -4,10 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from recon.analysis.correlation import (
     INNER_PRODUCT,
@@ -19,10 +17,8 @@ from recon.analysis.correlation import (
     half_width,
     similarity,
 )
+from recon.arrays import Array, Float64Array
 from recon.errors import InputError
-
-Array = npt.NDArray[Any]
-Floats = npt.NDArray[np.float64]
 
 CUT_PX = 40
 """Pixels on either side of the peak that are kept of a correlation's cut."""
@@ -32,20 +28,20 @@ CUT_PX = 40
 class DepthSimilarity:
     """PSFs of different depths compared."""
 
-    z_um: Floats
+    z_um: Float64Array
     """(n_z,): ascending."""
     middle_um: float
     """Depth of the PSF that the others are compared with."""
-    to_middle: Floats
+    to_middle: Float64Array
     """(n_z,): inner product with the middle PSF, both on the axis (Fig. A.3b)."""
-    near_cut: Floats
-    far_cut: Floats
-    cross_cut: Floats
+    near_cut: Float64Array
+    far_cut: Float64Array
+    cross_cut: Float64Array
     """``near_cut``, ``far_cut`` and ``cross_cut``: (2 CUT_PX + 1,): cuts along the columns through the peaks
     of both autocorrelations and of the cross-correlation of the nearest and the farthest PSF (Fig. A.3a)."""
 
 
-def across_depth(depths_um: Floats, planes: Array) -> DepthSimilarity:
+def across_depth(depths_um: Float64Array, planes: Array) -> DepthSimilarity:
     """Compare the central PSFs (n_z, height, width) of ascending depths."""
     middle = int(np.argmin(np.abs(1 / depths_um - np.mean(1 / depths_um[[0, -1]]))))
     return DepthSimilarity(
@@ -58,7 +54,7 @@ def across_depth(depths_um: Floats, planes: Array) -> DepthSimilarity:
     )
 
 
-def _cut(cut: Floats) -> Floats:
+def _cut(cut: Float64Array) -> Float64Array:
     peak = int(np.argmax(cut))
     index = np.arange(peak - CUT_PX, peak + CUT_PX + 1)
     inside = (index >= 0) & (index < len(cut))
@@ -71,7 +67,7 @@ degrees, nearest objects at 1.7 mm) needs a PSF every 0.4 mm, as the dissertatio
 MOST_PLANES = 512
 
 
-def lateral_spacing_um(response: Callable[[Floats], Floats], z_um: float) -> float:
+def lateral_spacing_um(response: Callable[[Float64Array], Float64Array], z_um: float) -> float:
     """Spacing of calibration points that samples the angular fall-off at Nyquist's rate (Eqs. 5.8, 5.9).
 
     The registered fall-off is ``f(atan(x / z))``; its spectrum is computed numerically and cut where it is
@@ -100,7 +96,7 @@ def lateral_spacing_um(response: Callable[[Floats], Floats], z_um: float) -> flo
     return float(z_um / (2 * highest))
 
 
-def gaussian_response(sigma_deg: float) -> Callable[[Floats], Floats]:
+def gaussian_response(sigma_deg: float) -> Callable[[Float64Array], Float64Array]:
     """Return a Gaussian angular response (Fig. 5.3a: 13 degrees)."""
     return lambda angles: np.asarray(np.exp(-0.5 * (angles / np.deg2rad(sigma_deg)) ** 2))
 
@@ -186,7 +182,7 @@ class LateralResolution:
         return self.mean_px * pitch_um * z_um / distance_um
 
     @classmethod
-    def of(cls, cuts: Sequence[Floats], level: float) -> LateralResolution:
+    def of(cls, cuts: Sequence[Float64Array], level: float) -> LateralResolution:
         """Measure the cuts of an autocorrelation along rows and columns."""
         y, x = (half_width(cut, level) for cut in cuts)
         return cls(level, (y, x))

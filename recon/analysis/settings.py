@@ -5,19 +5,15 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from recon.analysis.point_noise import AskedNoise
 from recon.analysis.resolution import axial_spacing_per_um, gaussian_response, lateral_spacing_um
+from recon.arrays import Array, Float64Array
 from recon.base.declare import option
 from recon.optics.fall_off import FallOff
 from recon.types import Calibration
-
-Array = npt.NDArray[Any]
-Floats = npt.NDArray[np.float64]
 
 STEEPEST = math.atan(40.0)
 """Angle at which a response is taken to have ended."""
@@ -121,7 +117,7 @@ def lateral_spacing(settings: AnalysisSettings, nearest_um: float, notes: list[s
     """Return how far apart, um, the nearest depth's PSFs are to be calibrated (Kuo 2020, Eqs. 5.8, 5.9)."""
     if (fall_off := settings.fall_off) is not None:
 
-        def along(y: float, x: float) -> Callable[[Floats], Floats]:
+        def along(y: float, x: float) -> Callable[[Float64Array], Float64Array]:
             return lambda angles: fall_off(*(n * np.tan(np.minimum(angles, STEEPEST)) for n in (y, x)))
 
         return min(lateral_spacing_um(f, nearest_um) for f in (along(1, 0), along(0, 1)))

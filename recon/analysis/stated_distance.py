@@ -6,11 +6,9 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
 from recon.analysis.points import PointTrial
-
-Floats = npt.NDArray[np.float64]
+from recon.arrays import Float64Array
 
 PROMISED, NEARER, AT_NEARER = 0.9, 0.8, 0.3
 """Share of the pairs that are told apart at the stated distance, and at ``NEARER`` of it at the most."""
@@ -112,7 +110,7 @@ def stated_px(tried: Sequence[TriedPair]) -> tuple[float | None, float | None]:
         return None, None
     centre = float(logs.mean())
 
-    def misfit(p: Floats) -> float:
+    def misfit(p: Float64Array) -> float:
         z = np.exp(p[0]) * (logs - centre - p[1 + axes])
         # A slope of ten to forty in log distance is usual; pairs told apart by luck do not flatten it.
         return float(

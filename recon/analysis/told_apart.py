@@ -20,12 +20,10 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-import numpy.typing as npt
 
 from recon.analysis.points import DIP
 from recon.analysis.stated_distance import AT_NEARER, FARTHEST, NEARER, PROMISED, TriedPair
-
-Floats = npt.NDArray[np.float64]
+from recon.arrays import Float64Array
 
 _SIGMAS = np.concatenate([np.arange(0.0, 0.6, 0.05), np.geomspace(0.6, 4.5, 20)])
 _USUAL = np.array([0.0, 0.55, np.log(0.03)])  # offset, slope, logarithm of the softness
@@ -85,7 +83,7 @@ class Told:
         return float(np.interp(px, _DISTANCES, self._shares))
 
     @cached_property
-    def _shares(self) -> Floats:
+    def _shares(self) -> Float64Array:
         apart, places = np.repeat(_DISTANCES, len(_PLACES)), np.tile(_PLACES, len(_DISTANCES))
         odds = _log_odds(_dips(self.sigma, apart, places), apart, *self.law)
         return np.asarray((1 / (1 + np.exp(-odds))).reshape(len(_DISTANCES), -1).mean(axis=1))
@@ -109,12 +107,14 @@ def stated_apart(tried: Sequence[TriedPair]) -> tuple[Told | None, Told | None]:
     return y, x
 
 
-def _log_odds(dips: Floats, px: Floats, offset: float, slope: float, softness: float) -> Floats:
+def _log_odds(
+    dips: Float64Array, px: Float64Array, offset: float, slope: float, softness: float
+) -> Float64Array:
     odds = (dips + offset + slope * np.log(px / 2) - DIP) / softness
     return np.asarray(np.where(dips > 0, np.clip(odds, -30, 30), _NONE))
 
 
-def _dips(sigma: float, px: Floats, places: Floats) -> Floats:
+def _dips(sigma: float, px: Float64Array, places: Float64Array) -> Float64Array:
     """Return the dip that two points of a Gaussian blur leave on pixels, the first at these places in one."""
     t, kernel = _kernel(sigma)
     first, second = (2.0 + places)[:, None], (2.0 + places + px)[:, None]
@@ -131,7 +131,7 @@ def _dips(sigma: float, px: Floats, places: Floats) -> Floats:
     return np.where(np.isfinite(valley), 1 - np.minimum(valley, 1e9) / lower, 0.0)
 
 
-def _kernel(sigma: float) -> tuple[Floats, Floats]:
+def _kernel(sigma: float) -> tuple[Float64Array, Float64Array]:
     from scipy.ndimage import gaussian_filter1d
 
     reach = int(np.ceil(1 + 4 * sigma)) * _PARTS

@@ -14,9 +14,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
-Floats = npt.NDArray[np.float64]
+from recon.arrays import Float64Array
 
 _SURE = 9.0
 """Sum of squares by which an explanation is worse that is ruled out: three standard deviations."""
@@ -164,7 +163,7 @@ def moved_along(seen: Sequence[Seen], distance_um: float) -> Explanation | None:
     errors = np.array([each.growth_error for each in seen])
     known = np.sqrt(errors**2 + (_LEAST_PX / extent) ** 2 + (_PARAXIAL * growth) ** 2)
 
-    def fitted(per_um: Floats, rest: Floats) -> float:
+    def fitted(per_um: Float64Array, rest: Float64Array) -> float:
         return float((per_um * rest / known**2).sum() / (per_um**2 / known**2).sum())
 
     apart = fitted(1 / (z + distance_um), growth)

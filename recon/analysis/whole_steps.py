@@ -6,18 +6,19 @@ from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
-import numpy.typing as npt
 
+from recon.arrays import Float32Array, Float64Array
 from recon.camera.grid import Grid
 
-Floats = npt.NDArray[np.float64]
-Plane = npt.NDArray[np.float32]
+Plane = Float32Array
 
 SPARE = 0.25
 """Part of a step by which a voxel may be smaller and still stands for it."""
 
 
-def in_whole_steps(read: Callable[[int], Plane], grid: Grid) -> tuple[Callable[[int], Plane], Grid, Floats]:
+def in_whole_steps(
+    read: Callable[[int], Plane], grid: Grid
+) -> tuple[Callable[[int], Plane], Grid, Float64Array]:
     """Sum voxels until they are as large as what a metric volume was made of.
 
     Parameters

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from recon.arrays import Array
 from recon.base.declare import Declaration, Option
 from recon.errors import InputError
 from recon.types import numbers_of, plain_array, plain_number
@@ -52,7 +53,7 @@ def require_shape(name: str, value: Any) -> tuple[int, int]:
 
 def require_numbers(
     name: str, array: npt.ArrayLike, expected: str, *, kinds: str = "uifb", least_axes: int = 1
-) -> npt.NDArray[Any]:
+) -> Array:
     """Return an array of numbers as it is, NaN where one is masked.
 
     ``kinds`` are NumPy's letters for them: real ones. Raises InputError for anything else: what is

@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 import numpy.typing as npt
 
-Array = npt.NDArray[Any]
+from recon.arrays import Array, BoolArray
 
 WHOLE = 0.9
 """Least share of the blocks that are whole, of the share of pixels that are not erased."""
@@ -64,7 +62,7 @@ def block_mean(
     return total
 
 
-def whole_blocks(valid: npt.NDArray[np.bool_], most: int) -> int:
+def whole_blocks(valid: BoolArray, most: int) -> int:
     """Return the side of blocks about the axis, at most ``most``, of which nearly all have no erased pixel.
 
     One erased pixel erases its block: a few hot pixels or a bright spot cost little, scattered ones nearly

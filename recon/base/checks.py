@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import math
 from numbers import Real
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
+from recon.arrays import Array, BoolArray, Float32Array
 from recon.base.blocks import block_mean
 from recon.base.noise import NoiseModel, estimate_deviation
 from recon.errors import InputError
@@ -42,7 +42,7 @@ DETAILS = ((0.1, 0.25), (0.02, 0.06))
 
 def as_channels(
     image: npt.ArrayLike, name: str, remedy: str = NEIGHBOURS, of_infinities: str = ""
-) -> npt.NDArray[np.float32]:
+) -> Float32Array:
     """Return an image (height, width[, n_channels]) of any numeric dtype as float32, channels first.
 
     Raises InputError when it has another number of axes, is empty, is no array of real numbers of float32,
@@ -59,9 +59,7 @@ def as_channels(
     return np.ascontiguousarray(single[None] if single.ndim == 2 else np.moveaxis(single, 2, 0))
 
 
-def require_finite(
-    array: npt.NDArray[Any], name: str, remedy: str = NEIGHBOURS, of_infinities: str = ""
-) -> None:
+def require_finite(array: Array, name: str, remedy: str = NEIGHBOURS, of_infinities: str = "") -> None:
     """Raise InputError when there are NaN or infinite values, saying how many and where the first is.
 
     ``remedy`` is what helps, ``of_infinities`` what does where none is NaN, if that is something else.
@@ -80,7 +78,7 @@ def require_finite(
         )
 
 
-def check_psf(psfs: npt.NDArray[np.float32]) -> tuple[str, ...]:
+def check_psf(psfs: Float32Array) -> tuple[str, ...]:
     """Check PSF images (n_channels, height, width); returns warnings.
 
     Raises InputError when a PSF is not finite, empty, constant or negative on the whole.
@@ -119,9 +117,7 @@ def check_psf(psfs: npt.NDArray[np.float32]) -> tuple[str, ...]:
     return tuple(warnings)
 
 
-def require_photograph(
-    data: npt.NDArray[np.float32], psfs: npt.NDArray[np.float32], valid: npt.NDArray[np.bool_]
-) -> None:
+def require_photograph(data: Float32Array, psfs: Float32Array, valid: BoolArray) -> None:
     """Refuse what no scene gives: the PSF itself for a photograph, and the two swapped.
 
     A photograph is the PSF's pattern many times over, ``|B(f)| / B(0) <= |H(f)| / H(0)`` for light that is
@@ -164,7 +160,7 @@ def require_photograph(
         )
 
 
-def _details(image: npt.NDArray[np.float32]) -> tuple[float, float]:
+def _details(image: Float32Array) -> tuple[float, float]:
     """Return how strong details of four to ten pixels are beside the light, and beside coarser ones.
 
     Light is what exceeds the darkest pixels: a black level that was not subtracted is none.
@@ -197,7 +193,7 @@ def many_saturated(share: float, n_pixels: int) -> bool:
     return share > SATURATED_SHARE and round(share * n_pixels) >= _FEW
 
 
-def saturated_share(image: npt.NDArray[Any]) -> float:
+def saturated_share(image: Array) -> float:
     """Return the share of pixels at exactly the maximum when it is suspicious, else 0.
 
     Clipped pixels are more than those just below; counts of a few photons become fewer towards the brightest.
@@ -211,13 +207,13 @@ def saturated_share(image: npt.NDArray[Any]) -> float:
     return share if not below.size or at_top > np.count_nonzero(below == below.max()) else 0.0
 
 
-def saturated_light(psf: npt.NDArray[Any]) -> float:
+def saturated_light(psf: Array) -> float:
     """Return the share of a PSF's light in pixels at exactly the maximum when it is suspicious, else 0."""
     total = float(np.sum(psf, dtype=np.float64))
     return saturated_share(psf) * psf.size * float(psf.max()) / total if total > 0 else 0.0
 
 
-def select_psf(calibration: Calibration, z_um: float | None) -> tuple[npt.NDArray[np.float32], float | None]:
+def select_psf(calibration: Calibration, z_um: float | None) -> tuple[Float32Array, float | None]:
     """Return the PSF (n_channels, height, width) for depth ``z_um`` and the depth it was taken at.
 
     The nearest calibrated plane in 1/z, along which PSFs change evenly (Kuo 2020, sec. 4.7); among equal

@@ -16,11 +16,11 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from recon.arrays import Array
 from recon.base.namespace import namespace_of
 from recon.base.threads import in_blocks, threads_here
 
-RealArray = npt.NDArray[Any]
-ComplexArray = npt.NDArray[Any]
+RealArray = Array
 
 
 @cache
@@ -53,7 +53,7 @@ def complex_dtype(dtype: npt.DTypeLike) -> np.dtype[Any]:
     return np.result_type(dtype, np.complex64)
 
 
-def rfft(x: RealArray, *, axes: int = 2, out: ComplexArray | None = None) -> ComplexArray:
+def rfft(x: RealArray, *, axes: int = 2, out: Array | None = None) -> Array:
     """Forward real transform over the last ``axes`` axes.
 
     Parameters
@@ -79,7 +79,7 @@ def rfft(x: RealArray, *, axes: int = 2, out: ComplexArray | None = None) -> Com
     return out
 
 
-def irfft(X: ComplexArray, last: int, *, axes: int = 2, out: RealArray | None = None) -> RealArray:
+def irfft(X: Array, last: int, *, axes: int = 2, out: RealArray | None = None) -> RealArray:
     """Inverse of :func:`rfft`, scaled by the reciprocal number of elements.
 
     Parameters
@@ -108,7 +108,7 @@ def irfft(X: ComplexArray, last: int, *, axes: int = 2, out: RealArray | None = 
     return out
 
 
-def rfft_strip(x: RealArray, start: int, out: ComplexArray) -> ComplexArray:
+def rfft_strip(x: RealArray, start: int, out: Array) -> Array:
     """Forward transform of images that are zero but for a strip of rows, a quarter cheaper when half are.
 
     Parameters
@@ -127,7 +127,7 @@ def rfft_strip(x: RealArray, start: int, out: ComplexArray) -> ComplexArray:
     return out
 
 
-def irfft_strip(X: ComplexArray, start: int, out: RealArray) -> RealArray:
+def irfft_strip(X: Array, start: int, out: RealArray) -> RealArray:
     """Rows ``start`` to ``start + rows`` of the inverse transform, into ``out`` (n, rows, width).
 
     ``X`` (n, height, width // 2 + 1) is overwritten.
@@ -139,7 +139,7 @@ def irfft_strip(X: ComplexArray, start: int, out: RealArray) -> RealArray:
     return out
 
 
-def multiply(X: ComplexArray, H: ComplexArray, *, conjugate: bool = False) -> None:
+def multiply(X: Array, H: Array, *, conjugate: bool = False) -> None:
     """Multiply ``X`` (n, height, width) in place by ``H`` (n or 1, height, width) or its conjugate.
 
     ``H`` may be real.
@@ -213,12 +213,12 @@ def _onto(result: RealArray, out: RealArray | None) -> RealArray:
     return out
 
 
-def _check(out: npt.NDArray[Any], shape: tuple[int, ...], dtype: np.dtype[Any]) -> None:
+def _check(out: Array, shape: tuple[int, ...], dtype: np.dtype[Any]) -> None:
     if out.shape != shape or out.dtype != dtype or not out.flags.c_contiguous:
         raise ValueError(f"out must be C-contiguous {dtype} {shape}, not {out.dtype} {out.shape}.")
 
 
-def _batched(x: npt.NDArray[Any], axes: int) -> npt.NDArray[Any]:
+def _batched(x: Array, axes: int) -> Array:
     """View as (batch, *transformed axes), so that few numba specialisations serve all shapes."""
     return x.reshape(-1, *x.shape[x.ndim - axes :])
 

@@ -2,18 +2,16 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
-import numpy.typing as npt
 
+from recon.arrays import Array
 from recon.base import fft
 
 LEAST_SHARE = 1e-3
 """Share of valid pixels from which a local mean is worth taking."""
 
 
-def fill_smoothly(image: npt.NDArray[Any], weight: npt.NDArray[Any]) -> None:
+def fill_smoothly(image: Array, weight: Array) -> None:
     """Replace, in place, pixels of weight 0 by local means of the others, from the nearest that there are.
 
     Gaussian means, each twice as wide as the one before, until one is as wide as the image; what is farther

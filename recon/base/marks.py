@@ -15,7 +15,8 @@ from enum import Enum
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
+
+from recon.arrays import Array
 
 _MARKS, _PIECE = 8, 1 << 16
 _APART = 1e-5
@@ -36,7 +37,7 @@ class Likeness(Enum):
     SAME = "to the last bit"
 
 
-def marks_of(array: npt.NDArray[Any]) -> Marks:
+def marks_of(array: Array) -> Marks:
     """Return an array's shape, norm, marks and checksum, as JSON holds them.
 
     Numbers that are none count as 0 among these; ``gaps`` tells how many they are, and which.
@@ -53,7 +54,7 @@ def marks_of(array: npt.NDArray[Any]) -> Marks:
     }
 
 
-def _marks(flat: npt.NDArray[Any]) -> tuple[float, list[float]]:
+def _marks(flat: Array) -> tuple[float, list[float]]:
     """Return the norm of numbers in a row, and their marks relative to it."""
     wave, longest = np.arange(1, _MARKS + 1), min(flat.size, _PIECE)
     within = np.cos(np.outer(2 * np.pi * np.modf(wave * 2**0.5)[0], np.arange(longest)) + wave[:, None])

@@ -8,25 +8,21 @@ squares. No offset is ever fitted. ``data_range`` is the truth's peak value (its
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
-import numpy.typing as npt
 
+from recon.arrays import Array
 from recon.base.arguments import require_numbers
 from recon.errors import InputError
 
-Image = npt.NDArray[Any]
 
-
-def scale_to(image: Image, truth: Image) -> float:
+def scale_to(image: Array, truth: Array) -> float:
     """Return the factor that fits ``image`` to ``truth`` in least squares (0 for an empty image)."""
     a, b = _pair(image, truth)
     power = float(np.vdot(a, a))
     return float(np.vdot(a, b)) / power if power > 0 else 0.0
 
 
-def nrmse(image: Image, truth: Image, *, fit_scale: bool = False) -> float:
+def nrmse(image: Array, truth: Array, *, fit_scale: bool = False) -> float:
     """Return ``||image - truth|| / ||truth||``: 0 is perfect, 1 is as bad as an empty image."""
     a, b = _pair(image, truth, fit_scale)
     norm = float(np.linalg.norm(b))
@@ -35,7 +31,7 @@ def nrmse(image: Image, truth: Image, *, fit_scale: bool = False) -> float:
     return float(np.linalg.norm(a - b)) / norm
 
 
-def psnr(image: Image, truth: Image, *, data_range: float | None = None, fit_scale: bool = False) -> float:
+def psnr(image: Array, truth: Array, *, data_range: float | None = None, fit_scale: bool = False) -> float:
     """Return ``10 log10(data_range^2 / mean squared error)`` in dB; infinite for equal images."""
     a, b = _pair(image, truth, fit_scale)
     peak = _peak(b, data_range)
@@ -43,7 +39,7 @@ def psnr(image: Image, truth: Image, *, data_range: float | None = None, fit_sca
     return float("inf") if error == 0 else float(10 * np.log10(peak**2 / error))
 
 
-def ssim(image: Image, truth: Image, *, data_range: float | None = None, fit_scale: bool = False) -> float:
+def ssim(image: Array, truth: Array, *, data_range: float | None = None, fit_scale: bool = False) -> float:
     """Return the mean structural similarity of Wang et al. 2004: 1 for equal images.
 
     Gaussian window of sigma 1.5 pixels cut at 11 x 11, K1 = 0.01, K2 = 0.03, population covariances, mean
@@ -58,15 +54,15 @@ def ssim(image: Image, truth: Image, *, data_range: float | None = None, fit_sca
     return float(np.mean([_ssim_2d(a[..., c], b[..., c], peak) for c in range(a.shape[2])]))
 
 
-def _ssim_2d(a: Image, b: Image, peak: float) -> float:
+def _ssim_2d(a: Array, b: Array, peak: float) -> float:
     from scipy.ndimage import correlate1d
 
     taps = np.exp(-0.5 * (np.arange(-5, 6) / 1.5) ** 2)
     taps /= taps.sum()
 
-    def local_mean(image: Image) -> Image:
+    def local_mean(image: Array) -> Array:
         blurred = correlate1d(correlate1d(image, taps, axis=0), taps, axis=1)
-        inner: Image = blurred[5:-5, 5:-5]
+        inner: Array = blurred[5:-5, 5:-5]
         return inner
 
     c1, c2 = (0.01 * peak) ** 2, (0.03 * peak) ** 2
@@ -79,14 +75,14 @@ def _ssim_2d(a: Image, b: Image, peak: float) -> float:
     return float(np.mean(similarity))
 
 
-def _peak(truth: Image, data_range: float | None) -> float:
+def _peak(truth: Array, data_range: float | None) -> float:
     peak = float(truth.max()) if data_range is None else float(data_range)
     if not peak > 0:
         raise ValueError(f"The data range must be above 0, not {peak:g}; give data_range.")
     return peak
 
 
-def _pair(image: Image, truth: Image, fit_scale: bool = False) -> tuple[Image, Image]:
+def _pair(image: Array, truth: Array, fit_scale: bool = False) -> tuple[Array, Array]:
     expected = "an array (height, width[, n_channels]) of real numbers"
     one, other = require_numbers("The image", image, expected), require_numbers("The truth", truth, expected)
     if one.shape != other.shape or one.ndim not in (2, 3):

@@ -6,8 +6,8 @@ import importlib
 from typing import Any, Literal
 
 import numpy as np
-import numpy.typing as npt
 
+from recon.arrays import Array
 from recon.errors import InputError
 
 Namespace = Any
@@ -53,7 +53,7 @@ def namespace_of(array: Any) -> Namespace:
     return importlib.import_module(type(array).__module__.split(".")[0])
 
 
-def to_host(array: Any) -> npt.NDArray[Any]:
+def to_host(array: Any) -> Array:
     """Return an array as one of NumPy; its own memory only where it comes from a GPU."""
     return np.asarray(array.get() if hasattr(array, "get") else array)
 

@@ -4,11 +4,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from numbers import Real
-from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
+from recon.arrays import Array, BoolArray, Float64Array
 from recon.errors import InputError
 from recon.types import plain_number
 
@@ -34,7 +33,7 @@ class NoiseModel:
             if not isinstance(value, Real):
                 raise InputError(f"{name} must be a number, in counts, not {type(value).__name__}.")
 
-    def deviation(self, measurement: npt.NDArray[Any]) -> float:
+    def deviation(self, measurement: Array) -> float:
         """Root mean square of the noise expected in a measurement (background subtracted, counts)."""
         signal = float(np.mean(np.maximum(measurement, 0), dtype=np.float64))
         return float(np.sqrt(self.read_noise**2 + self.counts_per_electron * signal))
@@ -66,7 +65,7 @@ GROUPS = 10
 """Groups of tiles of like brightness."""
 
 
-def estimate_deviation(measurement: npt.NDArray[Any], valid: npt.NDArray[np.bool_] | None = None) -> float:
+def estimate_deviation(measurement: Array, valid: BoolArray | None = None) -> float:
     """Estimate the root mean square of white and photon noise from one image.
 
     The stencil ``[1, -2, 1] x [1, -2, 1]`` (Immerkær 1996) removes what is locally planar; the median of its
@@ -113,7 +112,7 @@ def estimate_deviation(measurement: npt.NDArray[Any], valid: npt.NDArray[np.bool
     return float(np.sqrt(_mean_variance(brightness, variance)))
 
 
-def _mean_variance(brightness: npt.NDArray[np.float64], variance: npt.NDArray[np.float64]) -> float:
+def _mean_variance(brightness: Float64Array, variance: Float64Array) -> float:
     """Return the mean over tiles of the variance that brightness alone explains."""
     order = np.argsort(brightness)
     groups = np.array_split(order, GROUPS)
@@ -127,13 +126,11 @@ def _mean_variance(brightness: npt.NDArray[np.float64], variance: npt.NDArray[np
     return float(least[0] + slope * (np.mean(brightness) - dark))
 
 
-def _tiles(
-    m: npt.NDArray[np.float64], magnitude: npt.NDArray[np.float64]
-) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
+def _tiles(m: Float64Array, magnitude: Float64Array) -> tuple[Float64Array, Float64Array]:
     """Return mean brightness and noise variance of the tiles at least half covered by stencils."""
     rows, columns = (n // TILE for n in magnitude.shape)
 
-    def cut(image: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+    def cut(image: Float64Array) -> Float64Array:
         tiles = image[: rows * TILE, : columns * TILE].reshape(rows, TILE, columns, TILE)
         return tiles.transpose(0, 2, 1, 3).reshape(rows * columns, TILE * TILE)
 
@@ -147,9 +144,7 @@ def _tiles(
     return np.nanmean(m, axis=1), (median(magnitude, axis=1) / 0.6745) ** 2
 
 
-def _apply(
-    stencil: Stencil, stride: int, m: npt.NDArray[np.float64], valid: npt.NDArray[np.bool_]
-) -> npt.NDArray[np.float64]:
+def _apply(stencil: Stencil, stride: int, m: Float64Array, valid: BoolArray) -> Float64Array:
     """Return a stencil's values, of unit gain for white noise; NaN where it touches a pixel not valid."""
     height = m.shape[0] - stride * max(i for i, _, _ in stencil)
     width = m.shape[1] - stride * max(j for _, j, _ in stencil)

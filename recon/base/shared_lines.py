@@ -9,14 +9,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from math import comb
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
+from recon.arrays import Array, BoolArray, Float32Array, Float64Array
 from recon.base.filling import fill_smoothly
-
-Floats = npt.NDArray[np.float64]
 
 QUARTERS = 4
 """Parts of each line, which have to agree."""
@@ -59,11 +57,11 @@ class SharedLines:
         Offsets, counts; 0 where the lines have none of their own.
     """
 
-    rows: Floats
-    columns: Floats
+    rows: Float64Array
+    columns: Float64Array
 
     @property
-    def image(self) -> npt.NDArray[np.float32]:
+    def image(self) -> Float32Array:
         """Offsets of the pixels, (height, width)."""
         return np.asarray(self.rows[:, None] + self.columns, np.float32)
 
@@ -74,9 +72,7 @@ class SharedLines:
         return {name: deviation for name, deviation in both.items() if deviation > 0}
 
 
-def shared_lines(
-    data: npt.NDArray[Any], valid: npt.NDArray[np.bool_], noise: float, psfs: npt.NDArray[Any]
-) -> SharedLines | None:
+def shared_lines(data: Array, valid: BoolArray, noise: float, psfs: Array) -> SharedLines | None:
     """Return the offsets of rows and columns of one channel; None where the lines have none.
 
     Parameters
@@ -97,13 +93,13 @@ def shared_lines(
     return SharedLines(rows, columns) if rows.any() or columns.any() else None
 
 
-def _step(values: Floats) -> float:
+def _step(values: Float64Array) -> float:
     """Return what values are multiples of, as some of them tell: a pixel's least difference, counts."""
     steps = np.diff(np.unique(values[:: max(1, values.size // 4096)]))
     return float(steps.min()) if steps.size else 0.0
 
 
-def _offsets(image: Floats, valid: npt.NDArray[np.bool_], noise: float, psfs: npt.NDArray[Any]) -> Floats:
+def _offsets(image: Float64Array, valid: BoolArray, noise: float, psfs: Array) -> Float64Array:
     """Return what each row has by itself; 0 where that may be light."""
     offsets = np.zeros(len(image))
     seen, across = valid.any(axis=1), valid.any(axis=0)
@@ -123,26 +119,26 @@ def _offsets(image: Floats, valid: npt.NDArray[np.bool_], noise: float, psfs: np
     return offsets
 
 
-def _quarters(image: Floats, valid: npt.NDArray[np.bool_]) -> Floats:
+def _quarters(image: Float64Array, valid: BoolArray) -> Float64Array:
     """Return the means of each row's parts, (n, height); missing pixels are filled, in place."""
     if not valid.all():
         fill_smoothly(image, valid.astype(np.float64))
     return np.stack([part.mean(axis=1) for part in np.array_split(image, QUARTERS, axis=1)])
 
 
-def _deviation(quarters: Floats, order: int) -> float:
+def _deviation(quarters: Float64Array, order: int) -> float:
     """Return the deviation of what the quarters of rows share, by differences of neighbours, counts."""
     steps = np.diff(quarters, n=order, axis=1) / comb(2 * order, order) ** 0.5
     both = [float(np.mean(steps[i] * steps[j])) for i in range(QUARTERS) for j in range(i)]
     return float(np.sqrt(max(float(np.median(both)), 0.0)))
 
 
-def _fine(line: Floats) -> float:
+def _fine(line: Float64Array) -> float:
     """Return the size of a line's finer differences."""
     return float(np.linalg.norm(np.diff(line, n=FINE)))
 
 
-def _left_by_light(means: Floats, rows: npt.NDArray[np.intp], psfs: npt.NDArray[Any]) -> Floats | None:
+def _left_by_light(means: Float64Array, rows: npt.NDArray[np.intp], psfs: Array) -> Float64Array | None:
     """Return what light through the PSFs leaves of rows' means; None where that is unknown.
 
     Light of each row of the scene, none below zero, on the sensor and beyond.
@@ -167,14 +163,14 @@ def _left_by_light(means: Floats, rows: npt.NDArray[np.intp], psfs: npt.NDArray[
     return left
 
 
-def _cast(line: Floats, rows: npt.NDArray[np.intp]) -> Floats:
+def _cast(line: Float64Array, rows: npt.NDArray[np.intp]) -> Float64Array:
     """Return what rows of the sensor get of each row of the scene by a PSF's sums, (rows, scene)."""
     n = len(line)
     at = rows[:, None] - np.arange(rows[0] - n + 1, rows[-1] + 1)
     return np.where((at >= 0) & (at < n), line[np.clip(at, 0, n - 1)], 0)
 
 
-def _smooth(line: Floats) -> Floats:
+def _smooth(line: Float64Array) -> Float64Array:
     """Return the smooth curve through values with noise, as stiff as cross-validation asks for."""
     from scipy.fft import dct, idct
 

@@ -7,12 +7,11 @@ flat there, and stays as it is; so does a lobe of the PSF's own, whose border be
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
-import numpy.typing as npt
 
-FloatImage = npt.NDArray[np.float32]
+from recon.arrays import Array, Float32Array
+
+FloatImage = Float32Array
 
 BORDER = 0.04
 """Width of the border, relative to the shorter side."""
@@ -33,7 +32,7 @@ LEAST_RISE = 0.03
 """Rise relative to the mean light of the pattern, from which it is worth a word."""
 
 
-def sloping_light(psf: npt.NDArray[Any]) -> FloatImage | None:
+def sloping_light(psf: Array) -> FloatImage | None:
     """Return the plane of light, counts, that a PSF (height, width[, 3]) stands on; None where there is none.
 
     Its dark level is part of it. In colours each has its own, and all of them must be planes.
@@ -51,7 +50,7 @@ def rise_of(plane: FloatImage) -> float:
     return float(np.ptp(corners.reshape(4, -1).mean(axis=1)))
 
 
-def _plane(psf: npt.NDArray[Any]) -> FloatImage | None:
+def _plane(psf: Array) -> FloatImage | None:
     height, width = psf.shape
     wide = max(1, round(BORDER * min(height, width)))
     if min(height, width) < 2 * PARTS:
@@ -75,7 +74,7 @@ def _plane(psf: npt.NDArray[Any]) -> FloatImage | None:
     return plane if is_plane and rise > LEAST_RISE * light > 0 else None
 
 
-def _left_by(terms: npt.NDArray[Any], values: npt.NDArray[Any]) -> float:
+def _left_by(terms: Array, values: Array) -> float:
     """Return the root mean square of what the best sum of terms leaves."""
     best = np.linalg.lstsq(terms, values, rcond=None)[0]
     return float(np.sqrt(np.mean((values - terms @ best) ** 2)))

@@ -8,11 +8,10 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
+from recon.arrays import Array, Float32Array, Float64Array
 from recon.blind.made_up import alike_by_halves
 from recon.blind.polish import first_psf, offset_of, polish
 from recon.blind.psf_step import BeadMixer, refuse_what_is_no_beads, solve_psfs
@@ -24,8 +23,6 @@ from recon.errors import InputError
 from recon.priors import L1, NonNegativity
 from recon.solvers import Fista, StoppingRules
 
-Array = npt.NDArray[Any]
-Floats = npt.NDArray[np.float32]
 Progress = Callable[[str, float], object]
 
 _GRID_SHARE = 0.49
@@ -98,8 +95,8 @@ class BlindResult:
         Cosine similarity of the mean PSFs that either half of the images gives, their noise taken off.
     """
 
-    psfs: Floats
-    points: npt.NDArray[np.float64]
+    psfs: Float32Array
+    points: Float64Array
     beads: tuple[Points, ...]
     rank: int
     misfits: tuple[float, ...]
@@ -108,7 +105,7 @@ class BlindResult:
     sensor_shape: tuple[int, int]
     halves_alike: float
 
-    def on_sensor(self) -> Floats:
+    def on_sensor(self) -> Float32Array:
         """Return each PSF where a source at its point casts it: (n_psfs, sensor height, sensor width)."""
         height, width = self.sensor_shape
         p_height, p_width = self.psfs.shape[1:]
@@ -161,11 +158,11 @@ def calibrate_from_beads(
     weights = interpolation_weights(points, np.eye(len(points)), rows, columns).astype(np.float32)
 
     report("first PSF", 0.0)
-    psfs: Floats = np.repeat(first_psf(np.maximum(data, 0), psf_shape)[None], len(points), axis=0)
+    psfs: Float32Array = np.repeat(first_psf(np.maximum(data, 0), psf_shape)[None], len(points), axis=0)
     beads = np.zeros((len(data), *field_shape), np.float32)
     norm = float(np.linalg.norm(data))
     misfits: list[float] = []
-    best: Floats | None = None
+    best: Float32Array | None = None
     stopped = "the last rank was reached"
     ranks = [r for r in settings.ranks if r <= len(points)]
     for number, rank in enumerate(ranks):
@@ -217,7 +214,7 @@ def calibrate_from_beads(
     )
 
 
-def _check(data: Floats, psf_shape: tuple[int, int], settings: BlindSettings) -> None:
+def _check(data: Float32Array, psf_shape: tuple[int, int], settings: BlindSettings) -> None:
     if data.ndim != 3 or len(data) < 2:
         raise InputError(f"Two or more images (n, height, width) of beads are needed, not {data.shape}.")
     if not np.isfinite(data).all():
@@ -245,7 +242,7 @@ def _check(data: Floats, psf_shape: tuple[int, int], settings: BlindSettings) ->
         raise InputError(f"PSFs vary over the field with degree 0, 1 or 2, not {settings.degree}.")
 
 
-def _points(sensor: tuple[int, int], settings: BlindSettings) -> npt.NDArray[np.float64]:
+def _points(sensor: tuple[int, int], settings: BlindSettings) -> Float64Array:
     axes = [
         np.linspace(-0.5, 0.5, k) * settings.reach * n if k > 1 else np.zeros(1)
         for k, n in zip(settings.grid, sensor, strict=True)
@@ -254,13 +251,13 @@ def _points(sensor: tuple[int, int], settings: BlindSettings) -> npt.NDArray[np.
 
 
 def _solve_beads(
-    data: Floats,
-    psfs: Floats,
+    data: Float32Array,
+    psfs: Float32Array,
     points: Array,
-    start: Floats,
+    start: Float32Array,
     settings: BlindSettings,
     on_progress: Callable[[float], None],
-) -> Floats:
+) -> Float32Array:
     """Find the beads of each image with the PSFs fixed (Eq. 5.12): FISTA with a rigorous step."""
     sensor = (data.shape[1], data.shape[2])
     operator = local_convolution([FieldOfPsfs(psfs[:, None], points)], sensor)
@@ -275,7 +272,7 @@ def _solve_beads(
     return found
 
 
-def _by_convention(psfs: Floats, beads: Floats) -> tuple[Floats, Floats]:
+def _by_convention(psfs: Float32Array, beads: Float32Array) -> tuple[Float32Array, Float32Array]:
     """Centre the mean PSF and give it unit light; the beads are moved and scaled the other way."""
     rows, columns = offset_of(psfs)
     light = np.float32(psfs.sum() / len(psfs))

@@ -14,12 +14,12 @@ from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
+from recon.arrays import Array, BoolArray, Float32Array, Float64Array
 from recon.base.blocks import block_mean, enlarged
 from recon.base.fft import fast_shape
 from recon.blind.psf_step import BeadMixer
-from recon.camera.base import Array, Composition, Projection, estimate_norm
+from recon.camera.base import Composition, Projection, estimate_norm
 from recon.camera.convolution import Convolution, field_of
 from recon.camera.factors import Erasures
 from recon.camera.varying_psfs import bounding_window
@@ -28,7 +28,6 @@ from recon.priors import NonNegativity
 from recon.solvers import Fista, StoppingRules
 from recon.solvers.base import IterationRecord, Solver
 
-Floats = npt.NDArray[np.float32]
 Progress = Callable[[str, float], object]
 
 _COARSE_PX = 64  # rows of the coarsest images
@@ -105,11 +104,11 @@ class PicturePsf:
         light are NaN.
     """
 
-    psf: Floats
-    gains: npt.NDArray[np.float64]
-    brightness: npt.NDArray[np.float64]
-    stray: Floats
-    light: Floats
+    psf: Float32Array
+    gains: Float64Array
+    brightness: Float64Array
+    stray: Float32Array
+    light: Float32Array
     gamma: float
     misfit: float
     foreign: tuple[int, ...] = ()
@@ -220,7 +219,9 @@ def psf_work(shape: tuple[int, int, int, int], settings: PictureSettings) -> flo
     return work
 
 
-def foreign_photographs(data: Floats, known: Floats, settings: PictureSettings) -> tuple[int, ...]:
+def foreign_photographs(
+    data: Float32Array, known: Float32Array, settings: PictureSettings
+) -> tuple[int, ...]:
     """Return which photographs do not show their pictures: without them the others are explained far better.
 
     Parameters
@@ -233,7 +234,7 @@ def foreign_photographs(data: Floats, known: Floats, settings: PictureSettings) 
     data, known = (block_mean(stack, factor, about_axis=True) for stack in (data, known))
     quick = replace(settings, gamma=settings.gamma or 1.0, psf_iterations=_FOREIGN_ITERATIONS)
 
-    def left(numbers: Sequence[int]) -> npt.NDArray[np.float64]:
+    def left(numbers: Sequence[int]) -> Float64Array:
         """Return what is left of each photograph's energy with the PSF from some of them."""
         estimate = _Estimate(data[numbers], known[numbers], quick)
         estimate.solve(lambda _what, _share: None)
@@ -250,7 +251,7 @@ def foreign_photographs(data: Floats, known: Floats, settings: PictureSettings) 
     return tuple(sorted(set(range(len(data))) - set(kept)))
 
 
-def _gamma_worth_having(data: Floats, known: Floats, settings: PictureSettings) -> float:
+def _gamma_worth_having(data: Float32Array, known: Float32Array, settings: PictureSettings) -> float:
     """Return the pictures' exponent: 1, unless the one found explains clearly more."""
     linear, bent = (_Estimate(data, known, replace(settings, gamma=g)) for g in (1.0, None))
     for estimate in (linear, bent):
@@ -261,7 +262,7 @@ def _gamma_worth_having(data: Floats, known: Floats, settings: PictureSettings) 
 class _Estimate:
     """The unknowns at one scale, and what improves each."""
 
-    def __init__(self, data: Floats, known: Floats, settings: PictureSettings) -> None:
+    def __init__(self, data: Float32Array, known: Float32Array, settings: PictureSettings) -> None:
         self.settings = settings
         count, self.channels, *sensor = data.shape
         self.sensor = (sensor[0], sensor[1])
@@ -285,7 +286,7 @@ class _Estimate:
         """What is left of the photographs' standard deviation."""
         return float(np.sqrt(self.left.sum()) / np.linalg.norm(self._even_removed(self.data)))
 
-    def _where_unknown(self, known: Floats) -> npt.NDArray[np.bool_]:
+    def _where_unknown(self, known: Float32Array) -> BoolArray:
         """Return where there may be light that the pictures do not tell of: beyond them, where saturated.
 
         Black rows and columns at the edges of all pictures are beyond them.
@@ -303,7 +304,7 @@ class _Estimate:
             unknown[:, :, *self.window] |= known >= self.settings.saturated
         return unknown
 
-    def _as_light(self, pictures: Array) -> Floats:
+    def _as_light(self, pictures: Array) -> Float32Array:
         light = np.zeros((len(self.data), self.channels, *self.field), np.float32)
         light[:, :, *self.window] = pictures
         return light
@@ -335,7 +336,7 @@ class _Estimate:
                 report("light beyond the pictures", (number + part) / rounds)
                 self.solve_light()
 
-    def scene(self) -> Floats:
+    def scene(self) -> Float32Array:
         """Return all light in the photographs' unit but for the PSF: (n, n_channels, field)."""
         lit = self.brightness[:, None, None, None].astype(np.float32) * self.known + self.light
         return np.asarray(lit * self.gains[:, None, None].astype(np.float32), np.float32)
@@ -401,18 +402,18 @@ class _Estimate:
             found = solver.run(StoppingRules(iterations=self.settings.light_iterations)).solution
             self.light[:, c] = (found * where)[:, : self.field[0], : self.field[1]]
 
-    def seen(self, scene: Floats) -> Floats:
+    def seen(self, scene: Float32Array) -> Float32Array:
         """Return what the sensor sees of scenes (n, n_channels, field)."""
         camera = Convolution(self.psf, self.sensor, n_channels=self.channels)
         return np.stack([camera.forward(self._on_grid(one, camera)) for one in scene])
 
-    def _on_grid(self, images: Array, camera: Convolution) -> Floats:
+    def _on_grid(self, images: Array, camera: Convolution) -> Float32Array:
         padded = np.zeros((*images.shape[:-2], *camera.grid_shape), np.float32)
         padded[..., : self.field[0], : self.field[1]] = images
         return padded
 
     @staticmethod
-    def _even_removed(images: Floats) -> Floats:
+    def _even_removed(images: Float32Array) -> Float32Array:
         return np.asarray(images - images.mean(axis=(2, 3), keepdims=True), np.float32)
 
     def result(self) -> PicturePsf:
@@ -440,7 +441,7 @@ class EvenRemoved(Projection):
         return left
 
 
-def _check(data: Floats, known: Floats, settings: PictureSettings) -> None:
+def _check(data: Float32Array, known: Float32Array, settings: PictureSettings) -> None:
     if data.ndim != 4 or data.shape != known.shape or len(data) < 2:
         raise InputError(
             "Two or more photographs (n, n_channels, height, width) and pictures of the same shape are "

@@ -7,14 +7,12 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
+from recon.arrays import Array, Float32Array
 from recon.base.blocks import block_mean
 from recon.blind.known_pictures import PictureSettings, psf_from_pictures
 from recon.reconstruction.reconstruct import reconstruct
 
-Floats = npt.NDArray[np.float32]
-Image = npt.NDArray[Any]
 Progress = Callable[[str, float], object]
 
 POOR_DB = 3.0
@@ -42,14 +40,14 @@ class LeftOut:
     name: str
     psnr_db: float
     flat_db: float
-    image: Floats
+    image: Float32Array
 
     def to_json(self) -> dict[str, Any]:
         """Return what is kept of it with a calibration."""
         return {"name": self.name, "psnr_db": self.psnr_db, "even_db": self.flat_db}
 
 
-def fare(image: Image, picture: Image) -> tuple[float, Floats]:
+def fare(image: Array, picture: Array) -> tuple[float, Float32Array]:
     """Judge a reconstruction by the picture that it should show, both (height, width, n_channels).
 
     What no calibration by pictures can tell is not held against it: a shift by whole pixels, and a gain and
@@ -62,7 +60,7 @@ def fare(image: Image, picture: Image) -> tuple[float, Floats]:
     ndarray, float32
         The reconstruction after that shift, gain and offset.
     """
-    best: tuple[float, Floats] = (-np.inf, np.empty(0, np.float32))
+    best: tuple[float, Float32Array] = (-np.inf, np.empty(0, np.float32))
     truth = np.asarray(picture, np.float64)
     centred = truth - truth.mean(axis=(0, 1))
     for rows in range(-_SHIFT_PX, _SHIFT_PX + 1):
@@ -77,7 +75,9 @@ def fare(image: Image, picture: Image) -> tuple[float, Floats]:
     return best
 
 
-def judged_by(psf: Floats, photograph: Image, light: Image, name: str = "", binning: int = 1) -> LeftOut:
+def judged_by(
+    psf: Float32Array, photograph: Array, light: Array, name: str = "", binning: int = 1
+) -> LeftOut:
     """Reconstruct a photograph by default options with a PSF that was not made from it.
 
     Parameters
@@ -102,8 +102,8 @@ def judged_by(psf: Floats, photograph: Image, light: Image, name: str = "", binn
 
 
 def leave_out(
-    photographs: Image,
-    pictures: Image,
+    photographs: Array,
+    pictures: Array,
     names: Sequence[str],
     settings: PictureSettings | None = None,
     *,

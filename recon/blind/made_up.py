@@ -8,13 +8,11 @@ others; beads that are made up are many.
 from __future__ import annotations
 
 import numpy as np
-import numpy.typing as npt
 
+from recon.arrays import Float32Array
 from recon.blind.points import PointMixer, solve_smooth
 from recon.blind.polish import Polished, highest_degree_for
 from recon.camera.points import FieldFunctions
-
-Floats = npt.NDArray[np.float32]
 
 LEAST_ALIKE = 0.93
 """Likeness of both halves' PSFs below which PSFs are not to be relied on."""
@@ -25,7 +23,7 @@ MOST_BEADS = 50
 off the axis were wrong."""
 
 
-def alike_by_halves(data: Floats, polished: Polished, iterations: int) -> float:
+def alike_by_halves(data: Float32Array, polished: Polished, iterations: int) -> float:
     """Return the cosine similarity of the mean PSFs that two halves of the images give, 1 at best.
 
     Each half is fitted where the PSFs have light, with the beads that all images together gave. What noise
@@ -64,7 +62,7 @@ def alike_by_halves(data: Floats, polished: Polished, iterations: int) -> float:
     return min(float(np.vdot(*found) / lengths), 1.0) if lengths > 0 else 0.0
 
 
-def _deviation(data: Floats, polished: Polished) -> float:
+def _deviation(data: Float32Array, polished: Polished) -> float:
     """Return the noise where the model has least light, by the median: what is not explained there.
 
     Less than the noise where photons make most of it: too little is then taken off.

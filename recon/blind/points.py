@@ -7,19 +7,16 @@ than a pixel this model error exceeds the noise. A point with a continuous place
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
+from recon.arrays import Array, BoolArray, Float32Array
 from recon.base import fft
 from recon.camera.base import LinearOperator
 from recon.camera.convolution import field_of
 from recon.camera.points import FieldFunctions, Points
 
-Array = npt.NDArray[np.float32]
-Floats = npt.NDArray[np.float64]
-Numbers = npt.NDArray[Any]
+Numbers = Array
 
 
 _BLUR_PX = 0.8  # of the image in which the support is found
@@ -46,7 +43,7 @@ class Mixer(LinearOperator):
         self._seen = np.empty((n_images, *self._spectra.shape[2:]), np.complex64)
         self._rows = np.empty((n_images, sensor_shape[0], self._grid[1]), np.float32)
 
-    def forward(self, x: Numbers, out: Array | None = None) -> Array:
+    def forward(self, x: Numbers, out: Float32Array | None = None) -> Float32Array:
         """Return images (n_images, height, width) of PSFs (n_psfs, psf height, psf width)."""
         _, height, width = self.domain_shape
         padded = np.zeros((len(x), *self._grid), np.float32)
@@ -57,7 +54,7 @@ class Mixer(LinearOperator):
         rows = fft.irfft_strip(self._seen, height - 1, self._rows)
         return _into(out, rows[:, :, width - 1 : width - 1 + self.range_shape[2]])
 
-    def adjoint(self, y: Numbers, out: Array | None = None) -> Array:
+    def adjoint(self, y: Numbers, out: Float32Array | None = None) -> Float32Array:
         """Return the exact transpose."""
         _, height, width = self.domain_shape
         self._rows[...] = 0
@@ -76,7 +73,7 @@ class Mixer(LinearOperator):
         return float(np.sqrt(self.lipschitz))
 
 
-def _into(out: Array | None, values: Array) -> Array:
+def _into(out: Float32Array | None, values: Float32Array) -> Float32Array:
     if out is None:
         return values.copy()
     out[...] = values
@@ -130,7 +127,7 @@ class PointMixer(Mixer):
 
 def solve_smooth(
     mixer: PointMixer, images: Numbers, start: Numbers, support: Numbers | None, iterations: int
-) -> tuple[Array, float]:
+) -> tuple[Float32Array, float]:
     """Fit the PSFs of all field functions to the images: FISTA with the projection on the support as prox.
 
     The set is a subspace and the step ``1 / lipschitz``, so it converges to the least squares on it.
@@ -143,7 +140,7 @@ def solve_smooth(
     """
     kept = np.float32(1) if support is None else support.astype(np.float32)
     step = np.float32(1 / mixer.lipschitz)
-    x: Array = np.asarray(start * kept, np.float32)
+    x: Float32Array = np.asarray(start * kept, np.float32)
     y, t = x, 1.0
     for _ in range(iterations):
         new = (y - step * mixer.adjoint(mixer.forward(y) - images)) * kept
@@ -153,7 +150,7 @@ def solve_smooth(
     return x, float(np.linalg.norm(mixer.forward(x) - images))
 
 
-def support_of(psf: Numbers) -> npt.NDArray[np.bool_]:
+def support_of(psf: Numbers) -> BoolArray:
     """Return where a noisy PSF (height, width) has light: above the noise, in pieces of several pixels.
 
     The noise is read from the negative values, which light does not have. Elsewhere nothing but noise would
@@ -171,5 +168,5 @@ def support_of(psf: Numbers) -> npt.NDArray[np.bool_]:
     if not count:
         return np.ones(psf.shape, bool)
     sizes = ndimage.sum_labels(lit, pieces, np.arange(count + 1))
-    support: npt.NDArray[np.bool_] = ndimage.binary_dilation(sizes[pieces] >= _LEAST_PX)
+    support: BoolArray = ndimage.binary_dilation(sizes[pieces] >= _LEAST_PX)
     return support if support.any() else np.ones(psf.shape, bool)

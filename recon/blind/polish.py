@@ -4,23 +4,19 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
+from recon.arrays import Array, Float32Array, Float64Array
 from recon.blind.points import PointMixer, solve_smooth, support_of
 from recon.camera.points import FieldFunctions, PointImages, Points, cleaned, overlooked, refine
 from recon.camera.registration import displacement, shifted
-
-Array = npt.NDArray[Any]
-Floats = npt.NDArray[np.float32]
 
 ROUNDS = 4
 """Times the images are aligned: first to one of them, then to what was found."""
 
 
-def first_psf(images: Array, psf_shape: tuple[int, int]) -> Floats:
+def first_psf(images: Array, psf_shape: tuple[int, int]) -> Float32Array:
     """Return a noisy PSF from images (n, height, width) with light, cut to ``psf_shape``; sum 1."""
     # The image with the highest peak over its energy has the fewest overlaps: the best to align to.
     reference = images[int(np.argmax(images.max(axis=(1, 2)) / np.linalg.norm(images, axis=(1, 2))))]
@@ -105,17 +101,17 @@ class Polished:
         ``||f - b|| / ||b||`` after the rounds with each degree.
     """
 
-    psfs: Floats
+    psfs: Float32Array
     functions: FieldFunctions
     beads: tuple[Points, ...]
     misfits: tuple[float, ...]
 
-    def images(self, sensor_shape: tuple[int, int]) -> Floats:
+    def images(self, sensor_shape: tuple[int, int]) -> Float32Array:
         """Return what the model says of the images: (n_images, height, width)."""
         camera = PointImages(self.psfs, self.functions, sensor_shape)
         return np.stack([camera.image(points) for points in self.beads])
 
-    def at(self, places: npt.NDArray[np.float64]) -> Floats:
+    def at(self, places: Float64Array) -> Float32Array:
         """Return the PSFs at places (n, 2): (n, height, width)."""
         return np.tensordot(self.functions.at(places).astype(np.float32), self.psfs, 1)
 
@@ -126,7 +122,7 @@ def highest_degree_for(beads: int) -> int:
 
 
 def polish(
-    data: Floats,
+    data: Float32Array,
     beads: Sequence[Points],
     psf_shape: tuple[int, int],
     iterations: int,
@@ -152,7 +148,7 @@ def polish(
     norm = float(np.linalg.norm(data))
     degrees = range(highest_degree + 1)
     misfits: list[float] = []
-    psfs: Floats | None = None
+    psfs: Float32Array | None = None
     functions: FieldFunctions | None = None
     for degree in degrees:
         places = np.concatenate([points.places for points in beads])
@@ -180,7 +176,7 @@ def polish(
 
 
 def _better_points(
-    camera: PointImages, data: Floats, beads: Sequence[Points], noise: float
+    camera: PointImages, data: Float32Array, beads: Sequence[Points], noise: float
 ) -> tuple[Points, ...]:
     found = []
     for image, points in zip(data, beads, strict=True):
@@ -192,7 +188,7 @@ def _better_points(
     return tuple(found)
 
 
-def _centred(psfs: Floats, beads: Sequence[Points]) -> tuple[Floats, tuple[Points, ...]]:
+def _centred(psfs: Float32Array, beads: Sequence[Points]) -> tuple[Float32Array, tuple[Points, ...]]:
     """Give the mean PSF unit light, centred on the centre pixel; the beads go the other way."""
     from recon.camera.registration import shifted
 

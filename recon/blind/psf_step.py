@@ -3,20 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
+from recon.arrays import Array, Float32Array
 from recon.base import fft
 from recon.blind.points import Mixer
-from recon.camera.base import Array
 from recon.camera.convolution import field_of
 from recon.camera.points import Points
 from recon.camera.registration import LOCAL_MEAN_PX
 from recon.errors import InputError
-
-Floats = npt.NDArray[np.float32]
 
 LEAST_EXPLAINED = 0.75
 """Part of the structure above the noise that the beads have to explain."""
@@ -25,7 +21,7 @@ _SAME_BEAD_PX = 0.5  # a bead moved by less was not moved
 _SAME_SLIDE = 0.7  # of the beads at the same places: the slide was not moved
 
 
-def explained(data: Floats, model: Floats) -> float:
+def explained(data: Float32Array, model: Float32Array) -> float:
     """Return which part of the images' fine structure above the noise a model explains; 0 with none.
 
     Without what varies slowly, as any few points through a wide pattern make a haze.
@@ -36,7 +32,7 @@ def explained(data: Floats, model: Floats) -> float:
     """
     from scipy import ndimage
 
-    def fine(images: Floats) -> Floats:
+    def fine(images: Float32Array) -> Float32Array:
         sigma = (0, LOCAL_MEAN_PX, LOCAL_MEAN_PX)
         return np.asarray(images - ndimage.gaussian_filter(images, sigma, mode="nearest"), np.float32)
 
@@ -48,7 +44,7 @@ def explained(data: Floats, model: Floats) -> float:
     return 1 - max(left - noise, 0.0) / (there - noise)
 
 
-def refuse_what_is_no_beads(data: Floats, model: Floats, beads: Sequence[Points]) -> None:
+def refuse_what_is_no_beads(data: Float32Array, model: Float32Array, beads: Sequence[Points]) -> None:
     """Raise where the images cannot be of slides of beads, moved in between and seen by one optics.
 
     Parameters
@@ -76,7 +72,7 @@ def refuse_what_is_no_beads(data: Floats, model: Floats, beads: Sequence[Points]
                 )
 
 
-def _noise(image: Floats) -> float:
+def _noise(image: Float32Array) -> float:
     """Return the standard deviation of an image's noise, from second differences along the diagonals."""
     second = image[2:, 2:] - 2 * image[1:-1, 1:-1] + image[:-2, :-2]
     return float(1.4826 * np.median(np.abs(second - np.median(second))) / np.sqrt(6))
@@ -134,7 +130,7 @@ def limit_rank(psfs: Array, rank: int) -> Array:
 
 def solve_psfs(
     mixer: BeadMixer, images: Array, start: Array, rank: int, iterations: int
-) -> tuple[Floats, float]:
+) -> tuple[Float32Array, float]:
     """Fit PSFs of limited rank to images: FISTA whose prox is the projection on the rank (Eq. 5.13).
 
     The set is not convex, so momentum is dropped whenever the misfit grows; the step ``1 / lipschitz`` then
@@ -165,5 +161,5 @@ def solve_psfs(
     return x, misfit
 
 
-def _half_square(array: npt.NDArray[Any]) -> float:
+def _half_square(array: Array) -> float:
     return 0.5 * float(np.vdot(array, array).real)

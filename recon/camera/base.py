@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, overload
 import numpy as np
 import numpy.typing as npt
 
-Array = npt.NDArray[Any]
+from recon.arrays import Array
 
 
 class LinearOperator(ABC):

@@ -5,11 +5,12 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 import numpy.typing as npt
 
+from recon.arrays import Array, Float32Array, Float64Array
 from recon.base.checks import select_psf
 from recon.base.registry import Registry
 from recon.camera.base import LinearOperator
@@ -19,7 +20,6 @@ from recon.camera.varying_psfs import FieldOfPsfs, interpolation_weights, princi
 from recon.errors import InputError
 from recon.types import Calibration
 
-Array = npt.NDArray[Any]
 ModelName = Literal["auto", "convolution", "local", "lowrank"]
 MODELS: tuple[ModelName, ...] = ("auto", "convolution", "local", "lowrank")
 
@@ -79,11 +79,11 @@ class Depths:
         not known.
     """
 
-    z_um: npt.NDArray[np.float64]
-    central: npt.NDArray[np.float32]
+    z_um: Float64Array
+    central: Float32Array
     fields: list[FieldOfPsfs]
     warnings: tuple[str, ...] = ()
-    axis_um: npt.NDArray[np.float64] | None = None
+    axis_um: Float64Array | None = None
 
     @property
     def varies(self) -> bool:
@@ -106,7 +106,7 @@ class Depths:
         fields = [FieldOfPsfs(f.psfs[..., cut[0], cut[1]], f.points) for f in self.fields]
         return replace(self, central=self.central[..., cut[0], cut[1]], fields=fields)
 
-    def divided(self, gains: npt.NDArray[np.float32]) -> Depths:
+    def divided(self, gains: Float32Array) -> Depths:
         """Return the depths with every depth's PSFs divided by a number, (n_z,)."""
         if (gains == 1).all():
             return self
@@ -137,7 +137,7 @@ def sort_by_depth(calibration: Calibration) -> Depths:
     return Depths(z_um, np.stack(central), fields, words, np.array(axis_um))
 
 
-def members_of_depths(positions_um: npt.NDArray[np.float64]) -> list[npt.NDArray[np.intp]]:
+def members_of_depths(positions_um: Float64Array) -> list[npt.NDArray[np.intp]]:
     """Group sources (n, 3) by depth: index arrays, in the order in which the depths first appear.
 
     A stage does not come back to exactly the same z. Sources belong to one depth when they lie within
@@ -230,25 +230,23 @@ def choose_model(depths: Depths, wanted: ModelName) -> tuple[ModelName, str]:
     return "local", f"PSFs differ by {error:.1%} over the field, and it would take {rank} components"
 
 
-Floats = npt.NDArray[np.float32]
-
 LEAST_GAIN = 0.01
 """Least brightness relative to a depth's central PSF that is made up for: below it there is only noise."""
 
 
-def energies(psfs: Array) -> npt.NDArray[np.float64]:
+def energies(psfs: Array) -> Float64Array:
     """Return the sum of squares of every PSF, (n_z, n_channels): plane by plane, for memory's sake."""
     return np.array([np.sum(psf.astype(np.float64) ** 2, axis=(1, 2)) for psf in psfs])
 
 
-def plane_gains(depths: Depths) -> Floats:
+def plane_gains(depths: Depths) -> Float32Array:
     """Return the energy of every depth's central PSF, relative to their root mean square, (n_z,)."""
     energy = np.sqrt(np.sum(energies(depths.central), axis=1))
     relative = energy * np.sqrt(len(energy)) / max(float(np.linalg.norm(energy)), 1e-30)
     return np.where(relative > 0, relative, 1.0).astype(np.float32)
 
 
-def levelled(depths: Depths, sensor_shape: tuple[int, int], *, varying: bool) -> tuple[Depths, Floats]:
+def levelled(depths: Depths, sensor_shape: tuple[int, int], *, varying: bool) -> tuple[Depths, Float32Array]:
     """Bring all PSFs to one brightness: what l1 counts is then the light that falls on the sensor.
 
     A voxel whose PSF is brighter explains the same data with less of itself. Under a prior that counts

@@ -13,11 +13,12 @@ from functools import cached_property
 import numpy as np
 import numpy.typing as npt
 
+from recon.arrays import Array
 from recon.base import fft
 from recon.base.arguments import require_numbers, require_shape
 from recon.base.checks import require_finite
 from recon.base.threads import in_blocks
-from recon.camera.base import Array, LinearOperator
+from recon.camera.base import LinearOperator
 from recon.errors import InputError
 
 GROUPS = 8

@@ -11,9 +11,8 @@ no better than calibrated pairs are asked to: the range is as much wider.
 from __future__ import annotations
 
 import numpy as np
-import numpy.typing as npt
 
-Floats = npt.NDArray[np.float64]
+from recon.arrays import Float64Array
 
 _POWERS = (1.0, 1.5, 2.0)
 """Lenslets' patterns lose their likeness by about the first, smooth diffusers' by the second."""
@@ -22,7 +21,7 @@ _KNOWN, _OF_LOST = 0.002, 0.1  # likenesses agree with the law to that, and that
 
 
 def likeness_range(
-    apart: Floats, alike: Floats, distances: Floats, weights: Floats, gap: float
+    apart: Float64Array, alike: Float64Array, distances: Float64Array, weights: Float64Array, gap: float
 ) -> tuple[float, float]:
     """Return the least and the largest likeness that calibrated pairs allow.
 
@@ -39,8 +38,8 @@ def likeness_range(
     scales = np.geomspace(apart.min() / 30, 10 * apart.max(), _SCALES)[:, None, None]
     common = np.linspace(0, 1, _COMMON)[:, None]
 
-    def law(distance: Floats | float) -> Floats:
-        near: Floats = 1 / (1 + (np.asarray(distance) / scales) ** powers)
+    def law(distance: Float64Array | float) -> Float64Array:
+        near: Float64Array = 1 / (1 + (np.asarray(distance) / scales) ** powers)
         return common + (1 - common) * near
 
     known = (_KNOWN + _OF_LOST * (1 - alike)) ** -2

@@ -10,17 +10,14 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
+from recon.arrays import Array, Float32Array, Float64Array
 from recon.camera.camera_model import members_of_depths
 from recon.camera.registration import displacement, moved, register
 from recon.camera.spot_flow import met
 from recon.camera.transformed import geometric_centre, resampled
 from recon.errors import InputError
 from recon.types import Calibration
-
-Array = npt.NDArray[Any]
-Floats = npt.NDArray[np.float32]
 
 LEAST_LIKENESS = 0.5
 """Scaled neighbours less alike than this are not mixed: the mixture would be a double image."""
@@ -31,7 +28,7 @@ def paraxial_scale(z_from_um: float, z_to_um: float, distance_um: float) -> floa
     return (1 + distance_um / z_to_um) / (1 + distance_um / z_from_um)
 
 
-def central_psfs(calibration: Calibration) -> tuple[npt.NDArray[np.float64], Floats]:
+def central_psfs(calibration: Calibration) -> tuple[Float64Array, Float32Array]:
     """Return the calibrated depths, ascending, and of each the PSF nearest to the axis.
 
     Returns
@@ -43,7 +40,7 @@ def central_psfs(calibration: Calibration) -> tuple[npt.NDArray[np.float64], Flo
     return depths, calibration.psfs[chosen]
 
 
-def central_places(calibration: Calibration) -> npt.NDArray[np.float64]:
+def central_places(calibration: Calibration) -> Float64Array:
     """Return ``(x, y)`` of the PSFs that :func:`central_psfs` returns, micrometres: (n_z, 2)."""
     return np.asarray(calibration.source_positions_um[central_members(calibration), :2], np.float64)
 
@@ -75,7 +72,7 @@ class Mixture:
     dimmed: tuple[float, ...]
     offsets: tuple[tuple[float, float], ...]
 
-    def of(self, psfs: list[Floats], points: Any = None, target: Any = (0.0, 0.0)) -> Floats:
+    def of(self, psfs: list[Float32Array], points: Any = None, target: Any = (0.0, 0.0)) -> Float32Array:
         """Mix one photograph of each plane: displaced by ``points``, (row, column) each, into ``target``."""
         points = np.zeros((len(psfs), 2)) if points is None else np.asarray(points)
         parts = []
@@ -101,7 +98,7 @@ class Mixture:
         return np.asarray(mixed / np.where(total > 0, total, 1), np.float32)
 
 
-def mixture_at(depths: npt.NDArray[np.float64], psfs: Floats, z_um: float, distance_um: float) -> Mixture:
+def mixture_at(depths: Float64Array, psfs: Float32Array, z_um: float, distance_um: float) -> Mixture:
     """Return what PSFs at ``z_um`` are made of, by the central ones, (n_z, n_channels, height, width)."""
     if not z_um > 0:
         raise InputError(f"The depth to refocus to is above 0, not {z_um:g} um.")

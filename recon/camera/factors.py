@@ -8,12 +8,13 @@ Reconstructing it as such uses what was measured and invents nothing.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 import numpy.typing as npt
 
-from recon.camera.base import Array, Composition, LinearOperator, Projection
+from recon.arrays import Array, BoolArray, Float32Array, Float64Array
+from recon.camera.base import Composition, LinearOperator, Projection
 from recon.camera.convolution import Convolution
 from recon.errors import InputError, StructureError
 
@@ -33,7 +34,7 @@ class Erasures(Projection):
 
     def __init__(
         self,
-        valid: npt.NDArray[np.bool_],
+        valid: BoolArray,
         shape: tuple[int, ...],
         dtype: npt.DTypeLike = np.float32,
     ) -> None:
@@ -88,7 +89,7 @@ Pattern = Literal["RGGB", "GRBG", "GBRG", "BGGR"]
 PATTERNS: tuple[Pattern, ...] = ("RGGB", "GRBG", "GBRG", "BGGR")
 
 
-def split_bayer(raw: npt.NDArray[Any], pattern: Pattern) -> tuple[npt.NDArray[Any], npt.NDArray[np.bool_]]:
+def split_bayer(raw: Array, pattern: Pattern) -> tuple[Array, BoolArray]:
     """Return a Bayer raw frame as a colour measurement and its erasures, both for :func:`recon.reconstruct`.
 
     Parameters
@@ -109,7 +110,7 @@ def split_bayer(raw: npt.NDArray[Any], pattern: Pattern) -> tuple[npt.NDArray[An
     return np.where(erasures, raw.dtype.type(0), raw[..., None]), erasures
 
 
-def interpolate_bayer(raw: npt.NDArray[Any], pattern: Pattern) -> npt.NDArray[np.float32]:
+def interpolate_bayer(raw: Array, pattern: Pattern) -> Float32Array:
     """Return a colour image (height, width, 3) with missing colours as the mean of their nearest neighbours.
 
     For PSF images, which the model needs at every pixel. It blurs details finer than two pixels.
@@ -127,7 +128,7 @@ def interpolate_bayer(raw: npt.NDArray[Any], pattern: Pattern) -> npt.NDArray[np
     return np.stack(channels, axis=-1).astype(np.float32)
 
 
-def _sites(raw: npt.NDArray[Any], pattern: Pattern) -> npt.NDArray[np.bool_]:
+def _sites(raw: Array, pattern: Pattern) -> BoolArray:
     """Return where each colour was measured, (height, width, 3)."""
     if pattern not in PATTERNS:
         raise InputError(f"The Bayer pattern {pattern!r} is not known. Choose one of {', '.join(PATTERNS)}.")
@@ -183,7 +184,7 @@ class BackgroundRemoval(Projection):
         self,
         shape: tuple[int, int, int],
         n_frequencies: tuple[int, int] = (5, 5),
-        valid: npt.NDArray[np.bool_] | None = None,
+        valid: BoolArray | None = None,
         dtype: npt.DTypeLike = np.float32,
         restraint: float = 0.0,
     ) -> None:
@@ -197,7 +198,7 @@ class BackgroundRemoval(Projection):
         # Gram matrix of the basis on the valid pixels, (n_channels, ny nx, ny nx); the identity if all are.
         self._inverse = np.stack([np.linalg.pinv(self._gram(mask)) for mask in valid])
 
-    def _gram(self, mask: npt.NDArray[np.bool_]) -> npt.NDArray[np.float64]:
+    def _gram(self, mask: BoolArray) -> Float64Array:
         yy = np.einsum("ay,by->aby", self._rows, self._rows).reshape(-1, mask.shape[0])
         xx = np.einsum("ax,bx->abx", self._columns, self._columns).reshape(-1, mask.shape[1])
         ny, nx = len(self._rows), len(self._columns)
@@ -267,7 +268,7 @@ class BackgroundRemoval(Projection):
         return out
 
 
-def _cosines(count: int, length: int) -> npt.NDArray[np.float64]:
+def _cosines(count: int, length: int) -> Float64Array:
     """Return the ``count`` lowest vectors of the orthonormal DCT-II of ``length``."""
     k, n = np.arange(count)[:, None], np.arange(length) + 0.5
     basis = np.sqrt(2 / length) * np.cos(np.pi * k * n / length)

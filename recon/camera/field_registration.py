@@ -10,19 +10,17 @@ import hashlib
 import threading
 from collections import OrderedDict
 from dataclasses import replace
-from typing import Any
 from weakref import WeakKeyDictionary
 
 import numpy as np
 import numpy.typing as npt
 
+from recon.arrays import Array, BoolArray, Float32Array
 from recon.camera.registration import Registration, aligned, expected_shift, moved, register
 from recon.camera.varying_psfs import FieldOfPsfs, interpolation_weights
 from recon.errors import InputError
 from recon.types import Calibration
 
-Array = npt.NDArray[Any]
-Floats = npt.NDArray[np.float64]
 Group = npt.NDArray[np.intp]
 
 _SEARCH_PX, _SEARCH_PART = 16.0, 0.1
@@ -108,7 +106,7 @@ def one_psf(calibration: Calibration) -> Array:
     return registered_field(calibration, group)[0]
 
 
-def shown(shape: tuple[int, ...], rows: float, columns: float) -> npt.NDArray[np.bool_]:
+def shown(shape: tuple[int, ...], rows: float, columns: float) -> BoolArray:
     """Tell which pixels of a PSF registered from a displacement were photographed.
 
     Registration between pixels mixes the outermost row and column with the dark beyond: they do not count.
@@ -238,7 +236,7 @@ def remembered_field(calibration: Calibration, group: npt.NDArray[np.intp]) -> R
 _departures: WeakKeyDictionary[FieldOfPsfs, tuple[bytes, float, float]] = WeakKeyDictionary()
 
 
-def departure(field: FieldOfPsfs, central: npt.NDArray[np.float32]) -> tuple[float, float]:
+def departure(field: FieldOfPsfs, central: Float32Array) -> tuple[float, float]:
     """Return the squares of what a field's PSFs differ by from a central one, and of what that would show.
 
     ``central``, (n_channels, height, width); what was asked last of a field is remembered.

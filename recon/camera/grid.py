@@ -13,15 +13,14 @@ from functools import lru_cache
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import numpy.typing as npt
 
+from recon.arrays import Float32Array, Float64Array
 from recon.errors import InputError
 
 if TYPE_CHECKING:
     from scipy import sparse
 
-Floats = npt.NDArray[np.float64]
-Plane = npt.NDArray[np.float32]
+Plane = Float32Array
 
 FAR_UM = 1e9
 """What stands for infinity, a kilometre: light from there is parallel to d / z, 1e-5 for a centimetre."""
@@ -70,15 +69,15 @@ class Grid:
 
     shape: tuple[int, int, int]
     centre: tuple[int, int]
-    z_um: Floats
-    pitch_um: Floats
+    z_um: Float64Array
+    pitch_um: Float64Array
     sensor_pitch_um: float | None = None
-    axis_um: Floats | None = None
+    axis_um: Float64Array | None = None
     upright: bool = False
     made_of_um: tuple[float, float] | None = None
 
     @property
-    def spacing_um(self) -> Floats:
+    def spacing_um(self) -> Float64Array:
         """Distance from each plane to the next, positive; the last one's is that of the plane before it."""
         if len(self.z_um) < 2:
             return np.full(len(self.z_um), np.nan)
@@ -121,7 +120,7 @@ class Grid:
         pitch = (1 if self.upright else -1) * self.pitch_um[z]
         return float(self.centre[0] + (y_um - y) / pitch), float(self.centre[1] + (x_um - x) / pitch)
 
-    def spanned_by(self, places_um: Floats) -> tuple[float, float, float, float] | None:
+    def spanned_by(self, places_um: Float64Array) -> tuple[float, float, float, float] | None:
         """Return top, left, bottom and right of the pixels that places (n, 3) span; None where not known.
 
         Each place counts in the plane nearest to it.
@@ -133,7 +132,7 @@ class Grid:
         (top, left), (bottom, right) = seen.min(axis=0).tolist(), seen.max(axis=0).tolist()
         return top, left, bottom, right
 
-    def axis_weights(self) -> Floats:
+    def axis_weights(self) -> Float64Array:
         """Weights (n_z, 3) of the z, y and x differences for total variation in space instead of in voxels.
 
         A step between neighbours counts by the area of the face between their voxels; the x face of a plane
@@ -271,8 +270,8 @@ def metric_planes(plane: Callable[[int], Plane], grid: Grid, metric: Grid) -> Ca
 
 
 def metric_volume(
-    volume: npt.NDArray[np.float32], grid: Grid, voxel_um: float | None = None
-) -> tuple[npt.NDArray[np.float32], Grid]:
+    volume: Float32Array, grid: Grid, voxel_um: float | None = None
+) -> tuple[Float32Array, Grid]:
     """Return a volume (n_z, height, width[, n_channels]) on voxels of equal size, and their grid.
 
     Parameters and errors as :func:`metric_grid`, values as :func:`metric_planes`.
@@ -282,11 +281,11 @@ def metric_volume(
     return np.stack([made(z) for z in range(metric.shape[0])]), metric
 
 
-def _axis(grid: Grid) -> Floats:
+def _axis(grid: Grid) -> Float64Array:
     return np.zeros((len(grid.z_um), 2)) if grid.axis_um is None else np.asarray(grid.axis_um, np.float64)
 
 
-def _places(metric: Grid) -> tuple[Floats, Floats]:
+def _places(metric: Grid) -> tuple[Float64Array, Float64Array]:
     """Return y of the rows and x of the columns of a metric grid."""
     rows, columns = (
         (np.arange(n) - c) * metric.pitch_um[0] for n, c in zip(metric.shape[1:], metric.centre, strict=True)
@@ -294,12 +293,12 @@ def _places(metric: Grid) -> tuple[Floats, Floats]:
     return rows, columns
 
 
-def _nearer(nodes: Floats) -> float:
+def _nearer(nodes: Float64Array) -> float:
     """Return how far the volume goes on before its nearest plane: half a step, or to the diffuser."""
     return float(min((nodes[1] - nodes[0]) / 2, nodes[0]))
 
 
-def _shares(nodes: Floats, places: Floats, step: float) -> Floats:
+def _shares(nodes: Float64Array, places: Float64Array, step: float) -> Float64Array:
     """Return which share of each plane's light goes to each place, (n_places, n_nodes).
 
     Light a micrometre is interpolated; then each plane's shares are tilted, exponentially in depth, so that
@@ -309,7 +308,7 @@ def _shares(nodes: Floats, places: Floats, step: float) -> Floats:
     first, last = nodes[0] - _nearer(nodes), nodes[-1] + (nodes[-1] - nodes[-2]) / 2
     # Of a voxel at either end the part counts that is in the volume.
     inside = np.minimum(places + step / 2, last) - np.maximum(places - step / 2, first)
-    shares: Floats = _between(nodes, places, step) * np.clip(inside, 0, step)[:, None]
+    shares: Float64Array = _between(nodes, places, step) * np.clip(inside, 0, step)[:, None]
     # Of a plane on one side of all that has a share of it: the two places beside it, by their distances.
     beside = np.stack([np.interp(nodes, places, unit) for unit in np.eye(len(places))])
     for k, node in enumerate(nodes):
@@ -322,13 +321,13 @@ def _shares(nodes: Floats, places: Floats, step: float) -> Floats:
     return shares
 
 
-def _centred(shares: Floats, off: Floats) -> Floats:
+def _centred(shares: Float64Array, off: Float64Array) -> Float64Array:
     """Return shares times ``exp(a + b off)``: positive, their sum 1 and, by Newton, their mean ``off`` 0.
 
     As far as :data:`LEAN` lets them: steps that differ by more would leave what is even in bands.
     """
     tilt, most = 0.0, LEAN / float(off[-1] - off[0])
-    tilted: Floats = shares
+    tilted: Float64Array = shares
     for _ in range(50):
         tilted = shares * np.exp(tilt * off)
         tilted /= tilted.sum()
@@ -340,7 +339,7 @@ def _centred(shares: Floats, off: Floats) -> Floats:
     return tilted
 
 
-def _between(nodes: Floats, places: Floats, step: float) -> Floats:
+def _between(nodes: Float64Array, places: Float64Array, step: float) -> Float64Array:
     """Weights (n_places, n_nodes) of linear interpolation; of its triangular mean where the steps are larger.
 
     Constant beyond the ends.
@@ -358,7 +357,7 @@ def _between(nodes: Floats, places: Floats, step: float) -> Floats:
     return total
 
 
-def _seen_by(n: int, centre: int, upright: bool, offsets: Floats, step: float) -> sparse.csr_array:
+def _seen_by(n: int, centre: int, upright: bool, offsets: Float64Array, step: float) -> sparse.csr_array:
     """Return the matrix (n_places, n) that takes pixels to places.
 
     ``offsets`` are the places from the axis and ``step`` that from one to the next, both in pixels.
@@ -375,7 +374,7 @@ def _seen_by(n: int, centre: int, upright: bool, offsets: Floats, step: float) -
     return sparse.csr_array((weights[used].astype(np.float32), (rows[used], near[used])), shape=(len(at), n))
 
 
-def plane_of(z_um: float, planes_um: Floats) -> float:
+def plane_of(z_um: float, planes_um: Float64Array) -> float:
     """Return the number of the plane at a depth, between two or more and beyond them evenly in ``1 / z``."""
     order = np.argsort(1 / planes_um)
     near = 1 / planes_um[order]

@@ -15,13 +15,10 @@ from functools import partial
 from typing import Any, Protocol
 
 import numpy as np
-import numpy.typing as npt
 
+from recon.arrays import Array, BoolArray, Float64Array
 from recon.camera.factors import BackgroundRemoval
 from recon.camera.points import PointImages, Points, cleaned
-
-Array = npt.NDArray[Any]
-Floats = npt.NDArray[np.float64]
 
 SURE = 5.0
 """Times its own deviation, for a point's light to be believed."""
@@ -52,7 +49,7 @@ class Photograph(Protocol):
     """
 
     data: Array
-    valid: npt.NDArray[np.bool_]
+    valid: BoolArray
     removal: BackgroundRemoval | None
     dtype: np.dtype[Any]
 
@@ -63,7 +60,7 @@ def believed(
     points: Points,
     cancel: threading.Event | None = None,
     on_step: Callable[[float], object] | None = None,
-) -> tuple[Points, Floats]:
+) -> tuple[Points, Float64Array]:
     """Fit points to a photograph, without those whose light is not believed.
 
     Parameters
@@ -115,7 +112,7 @@ def misfit(camera: PointImages, part: Photograph, points: Points) -> tuple[float
     return (left / pixels) ** 0.5, (max(left - pixels, 0.0) / max(light, 1e-30)) ** 0.5
 
 
-def _derivatives(camera: PointImages, part: Photograph, points: Points) -> tuple[Floats, Floats]:
+def _derivatives(camera: PointImages, part: Photograph, points: Points) -> tuple[Float64Array, Float64Array]:
     """Return what is left of the data, (pixels,), and its slopes by each point's coordinates and light.
 
     Slopes are (n * (coordinates + 1), pixels).
@@ -135,10 +132,10 @@ def _derivatives(camera: PointImages, part: Photograph, points: Points) -> tuple
     return rest.ravel(), images.reshape(len(images), -1)
 
 
-def _told(part: Photograph, image: Array) -> Floats:
+def _told(part: Photograph, image: Array) -> Float64Array:
     """Return what the data tell of an image: valid pixels, without a smooth background."""
     kept = np.where(part.valid, image, 0).astype(part.dtype)
-    told: Floats = kept[0] if part.removal is None else part.removal.forward(kept)[0]
+    told: Float64Array = kept[0] if part.removal is None else part.removal.forward(kept)[0]
     return told
 
 
@@ -173,7 +170,7 @@ def _fitted(
     return points
 
 
-def _covariance(camera: PointImages, part: Photograph, points: Points) -> Floats:
+def _covariance(camera: PointImages, part: Photograph, points: Points) -> Float64Array:
     """Return the covariance of every point's coordinates and light, (n, coordinates + 1, the same)."""
     count = points.places.shape[1] + 1
     if not len(points):

@@ -8,12 +8,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
+from recon.arrays import Float32Array, Float64Array
 from recon.base import fft
-
-Array = npt.NDArray[np.float32]
-Floats = npt.NDArray[np.float64]
 
 _MARGIN = 4  # pixels around a PSF for the tails of a shift between pixels
 _LARGEST_MOVE_PX = 0.5
@@ -42,7 +39,7 @@ class FieldFunctions:
         ``(row, column)`` of the beads; at least as many as functions, not all on a line.
     """
 
-    def __init__(self, degree: int, places: Floats) -> None:
+    def __init__(self, degree: int, places: Float64Array) -> None:
         self.degree = degree
         self._low, self._high = places.min(axis=0), places.max(axis=0)
         _, upper = np.linalg.qr(self._monomials(places) / np.sqrt(len(places)))
@@ -50,11 +47,11 @@ class FieldFunctions:
         self._to_orthonormal = upper * np.sign(np.diag(upper))[:, None]
         self.count = len(upper)
 
-    def at(self, places: Floats) -> Floats:
+    def at(self, places: Float64Array) -> Float64Array:
         """Return the functions' values at places (n, 2): (n, count)."""
         return np.asarray(np.linalg.solve(self._to_orthonormal.T, self._monomials(places).T).T)
 
-    def _monomials(self, places: Floats) -> Floats:
+    def _monomials(self, places: Float64Array) -> Float64Array:
         middle, half = (self._low + self._high) / 2, np.maximum((self._high - self._low) / 2, 1e-9)
         row, column = np.clip((places - middle) / half, -1, 1).T
         powers = [(n - m, m) for n in range(self.degree + 1) for m in range(n + 1)]
@@ -72,8 +69,8 @@ class Points:
     light : ndarray, float64, (n,)
     """
 
-    places: Floats
-    light: Floats
+    places: Float64Array
+    light: Float64Array
 
     def __len__(self) -> int:
         return len(self.light)
@@ -90,14 +87,14 @@ class PointImages:
     sensor_shape : (int, int)
     """
 
-    def __init__(self, psfs: Array, functions: FieldFunctions, sensor_shape: tuple[int, int]) -> None:
+    def __init__(self, psfs: Float32Array, functions: FieldFunctions, sensor_shape: tuple[int, int]) -> None:
         self._functions, self._sensor = functions, sensor_shape
         self.psfs = psfs
         self._shape = psfs.shape[1] + 2 * _MARGIN, psfs.shape[2] + 2 * _MARGIN
         self._f_y = np.fft.fftfreq(self._shape[0])[:, None]
         self._f_x = np.fft.rfftfreq(self._shape[1])[None, :]
 
-    def patch(self, place: Floats, *, slopes: bool = False) -> tuple[Array, tuple[slice, slice]]:
+    def patch(self, place: Float64Array, *, slopes: bool = False) -> tuple[Float32Array, tuple[slice, slice]]:
         """Return the image of a point of unit light and where on the sensor it lies.
 
         Parameters
@@ -131,22 +128,22 @@ class PointImages:
             on_sensor.append(slice(low, high))
         return images[:, inside[0], inside[1]], (on_sensor[0], on_sensor[1])
 
-    def within(self, places: Floats) -> Floats:
+    def within(self, places: Float64Array) -> Float64Array:
         """Return places, (n, 2), as far as this camera tells of them: as they are."""
         return places
 
-    def _seen(self, place: Floats, slopes: bool) -> tuple[Array, tuple[Array, ...]]:
+    def _seen(self, place: Float64Array, slopes: bool) -> tuple[Float32Array, tuple[Float32Array, ...]]:
         """Return a PSF, and with ``slopes`` how it changes with what a place has before row and column."""
         del slopes
         weights = self._functions.at(place[None])[0].astype(np.float32)
         return np.tensordot(weights, self.psfs, 1), ()
 
-    def _padded(self, psf: Array) -> Array:
+    def _padded(self, psf: Float32Array) -> Float32Array:
         padded = np.zeros(self._shape, np.float32)
         padded[_MARGIN:-_MARGIN, _MARGIN:-_MARGIN] = psf
         return padded
 
-    def image(self, points: Points) -> Array:
+    def image(self, points: Points) -> Float32Array:
         """Return the image (height, width) of all points."""
         seen = np.zeros(self._sensor, np.float32)
         for place, light in zip(points.places, points.light, strict=True):
@@ -155,7 +152,9 @@ class PointImages:
         return seen
 
 
-def refine(camera: PointImages, image: Array, points: Points, sweeps: int = 2) -> tuple[Points, Array]:
+def refine(
+    camera: PointImages, image: Float32Array, points: Points, sweeps: int = 2
+) -> tuple[Points, Float32Array]:
     """Fit place and light of each point in turn, the others fixed: Gauss-Newton steps that only descend.
 
     Returns
@@ -172,7 +171,9 @@ def refine(camera: PointImages, image: Array, points: Points, sweeps: int = 2) -
     return Points(places, light), left
 
 
-def _refined(camera: PointImages, left: Array, place: Floats, light: float) -> tuple[Floats, float]:
+def _refined(
+    camera: PointImages, left: Float32Array, place: Float64Array, light: float
+) -> tuple[Float64Array, float]:
     """Improve one point; ``left`` is kept up to date."""
     patch, where = camera.patch(place, slopes=True)
     if not patch.any():
@@ -196,7 +197,7 @@ def _refined(camera: PointImages, left: Array, place: Floats, light: float) -> t
     return best_place, best_light
 
 
-def _fitted(patch: Array, data: Array) -> tuple[float, float]:
+def _fitted(patch: Float32Array, data: Float32Array) -> tuple[float, float]:
     """Return the best light, not negative, and by how much it lessens the squared misfit."""
     energy = float(np.vdot(patch, patch))
     inner = max(float(np.vdot(patch, data)), 0.0)
@@ -206,7 +207,7 @@ def _fitted(patch: Array, data: Array) -> tuple[float, float]:
 def cleaned(camera: PointImages, points: Points, noise: float, weakest: float = WEAKEST) -> Points:
     """Merge points that are one, and drop those dimmer than noise allows or a share of the median light."""
     order = np.argsort(-points.light)
-    places: list[Floats] = []
+    places: list[Float64Array] = []
     light: list[float] = []
     for k in order:
         near = [i for i, place in enumerate(places) if np.linalg.norm(place - points.places[k]) < _SAME_PX]
@@ -225,7 +226,7 @@ def cleaned(camera: PointImages, points: Points, noise: float, weakest: float = 
     return Points(np.array(places)[kept].reshape(-1, points.places.shape[1]), np.array(light)[kept])
 
 
-def overlooked(camera: PointImages, left: Array, points: Points, noise: float) -> Points:
+def overlooked(camera: PointImages, left: Float32Array, points: Points, noise: float) -> Points:
     """Return the points with those added that still stand out of what is left of the image."""
     from scipy import ndimage
 
@@ -251,7 +252,7 @@ def overlooked(camera: PointImages, left: Array, points: Points, noise: float) -
     return Points(np.concatenate([points.places, added]), np.concatenate([points.light, lights]))
 
 
-def points_on_grid(beads: Floats, centre: tuple[int, int], least: float = 0.1) -> Points:
+def points_on_grid(beads: Float64Array, centre: tuple[int, int], least: float = 0.1) -> Points:
     """Return the blobs of a bead image (height, width) on the field's grid as points: centroid and light.
 
     Those whose peak is ``least`` of the brightest or more.

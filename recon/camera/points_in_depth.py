@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import numpy as np
-import numpy.typing as npt
 
+from recon.arrays import Float32Array, Float64Array
 from recon.camera.depth_mixture import mixture_at
 from recon.camera.grid import Grid, plane_of
-from recon.camera.points import Array, FieldFunctions, Floats, PointImages
+from recon.camera.points import FieldFunctions, PointImages
 
 STEPS = 4
 """PSFs that are made a gap between planes; between them patterns are mixed evenly."""
@@ -38,8 +38,8 @@ class ImagesInDepth(PointImages):
 
     def __init__(
         self,
-        z_um: npt.NDArray[np.float64],
-        psfs: Array,
+        z_um: Float64Array,
+        psfs: Float32Array,
         distance_um: float,
         sensor_shape: tuple[int, int],
     ) -> None:
@@ -48,7 +48,7 @@ class ImagesInDepth(PointImages):
         self._order = np.argsort(z_um)
         self._depths = z_um[self._order]
         self._distance_um = distance_um
-        self._kept: dict[int, Array] = {}
+        self._kept: dict[int, Float32Array] = {}
         self._most_kept = max(KEPT_BYTES // psfs[0].nbytes, 2)
 
     def depth_um(self, plane: float) -> float:
@@ -61,12 +61,12 @@ class ImagesInDepth(PointImages):
         """Return the number of a depth's plane."""
         return plane_of(z_um, 1 / self._near)
 
-    def within(self, places: Floats) -> Floats:
+    def within(self, places: Float64Array) -> Float64Array:
         """Return places, (n, 3), none farther beyond the outermost planes than :data:`BEYOND`."""
         plane = np.clip(places[:, :1], -BEYOND, len(self._near) - 1 + BEYOND)
         return np.hstack([plane, places[:, 1:]])
 
-    def _seen(self, place: Floats, slopes: bool) -> tuple[Array, tuple[Array, ...]]:
+    def _seen(self, place: Float64Array, slopes: bool) -> tuple[Float32Array, tuple[Float32Array, ...]]:
         at = float(place[0]) * STEPS
         first = int(np.floor(at))
         before, after = self._made(first), self._made(first + 1)
@@ -74,7 +74,7 @@ class ImagesInDepth(PointImages):
         psf = np.asarray((1 - share) * before + share * after, np.float32)
         return psf, ((np.asarray(STEPS * (after - before), np.float32),) if slopes else ())
 
-    def _made(self, step: int) -> Array:
+    def _made(self, step: int) -> Float32Array:
         """Return the PSF of a part of a plane, made or kept."""
         if step not in self._kept:
             if len(self._kept) >= self._most_kept:
@@ -82,14 +82,14 @@ class ImagesInDepth(PointImages):
             self._kept[step] = self._make(step)
         return self._kept[step]
 
-    def _make(self, step: int) -> Array:
+    def _make(self, step: int) -> Float32Array:
         """Return the PSF of a part of a plane."""
         if step % STEPS == 0 and 0 <= step // STEPS < len(self._near):
-            own: Array = self.psfs[step // STEPS]
+            own: Float32Array = self.psfs[step // STEPS]
             return own
         psfs = self.psfs[self._order][:, None]
         mixture = mixture_at(self._depths, psfs, self.depth_um(step / STEPS), self._distance_um)
-        made: Array = mixture.of([psfs[k] for k in mixture.members])[0]
+        made: Float32Array = mixture.of([psfs[k] for k in mixture.members])[0]
         return made
 
 
@@ -102,25 +102,25 @@ class Rays:
         axis = np.zeros((len(grid.z_um), 2)) if grid.axis_um is None else grid.axis_um
         self._axis = axis / grid.z_um[:, None]
 
-    def _axis_at(self, plane: float) -> Floats:
+    def _axis_at(self, plane: float) -> Float64Array:
         """Return the direction ``(x, y) / z`` of a plane's middle: it goes evenly with the pattern."""
         first = int(np.clip(np.floor(plane), 0, len(self._axis) - 2))
         share = plane - first
         return np.asarray((1 - share) * self._axis[first] + share * self._axis[first + 1])
 
-    def place_of(self, place_um: Floats) -> Floats:
+    def place_of(self, place_um: Float64Array) -> Float64Array:
         """Return plane, row and column, these from the axis, of ``(x, y, z)``."""
         plane = self._camera.plane_of(float(place_um[2]))
         column, row = (self._axis_at(plane) - place_um[:2] / place_um[2]) / self._per_pixel
         return np.array([plane, row, column])
 
-    def um_of(self, place: Floats) -> Floats:
+    def um_of(self, place: Float64Array) -> Float64Array:
         """Return the inverse of :meth:`place_of`."""
         z_um = self._camera.depth_um(float(place[0]))
         ray = self._axis_at(float(place[0])) - self._per_pixel * place[:0:-1]
         return np.append(ray * z_um, z_um)
 
-    def slopes_of(self, place: Floats) -> Floats:
+    def slopes_of(self, place: Float64Array) -> Float64Array:
         """Return by how much ``(x, y, z)`` change with plane, row and column: (3, 3)."""
         steps = SHORT * np.eye(3)
         return np.stack([self.um_of(place + by) - self.um_of(place - by) for by in steps], axis=1) / (

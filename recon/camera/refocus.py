@@ -13,8 +13,8 @@ from itertools import combinations
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
+from recon.arrays import Array, Float32Array, Float64Array
 from recon.camera.depth_likeness import likeness_range
 from recon.camera.depth_mixture import (
     Mixture,
@@ -29,9 +29,6 @@ from recon.camera.grid import FAR_UM, depth_in_words
 from recon.camera.registration import displacement, moved, rescaled
 from recon.errors import InputError
 from recon.types import Calibration
-
-Array = npt.NDArray[Any]
-Floats = npt.NDArray[np.float32]
 
 _PLANES, _PAIRS = 4, 4  # nearest planes, and pairs of them, whose likeness tells how it goes with distance
 _BEYOND = 0.5  # part of what is lost beyond the calibrated depths that is not known
@@ -64,7 +61,7 @@ class Refocused:
         fewer than three depths, and too far from them.
     """
 
-    psf: Floats
+    psf: Float32Array
     z_um: float
     from_z_um: tuple[float, ...]
     scales: tuple[float, ...]
@@ -122,7 +119,7 @@ class Refocused:
         return f"{how} at {sources} mm{place} (Kuo 2020, Eq. 5.2): {error}"
 
 
-def refocus_psf(psf: Array, z_from_um: float, z_to_um: float, distance_um: float) -> Floats:
+def refocus_psf(psf: Array, z_from_um: float, z_to_um: float, distance_um: float) -> Float32Array:
     """Bring an on-axis PSF (..., height, width) from one depth to another (Eq. 5.2).
 
     Scaled about the sensor's centre, which lies on the axis (see :mod:`recon.types`); brightness on a pixel
@@ -183,17 +180,17 @@ def refocus(
     )
 
 
-def psf_at(calibration: Calibration, z_um: float) -> Floats:
+def psf_at(calibration: Calibration, z_um: float) -> Float32Array:
     """Return the PSF of :func:`refocus` alone, colours averaged, (height, width): a third of the time."""
     depths, psfs = central_psfs(calibration)
     mixture = mixture_at(depths, psfs, z_um, sensor_distance_um(calibration))
-    averaged: Floats = mixture.of([psfs[k] for k in mixture.members]).mean(axis=0)
+    averaged: Float32Array = mixture.of([psfs[k] for k in mixture.members]).mean(axis=0)
     return averaged
 
 
 def _expected_similarity(
-    depths: npt.NDArray[np.float64],
-    psfs: Floats,
+    depths: Float64Array,
+    psfs: Float32Array,
     z_um: float,
     mixture: Mixture,
     distance_um: float,

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from recon.arrays import Float32Array, Float64Array
 from recon.camera.camera_model import members_of_depths, one_depth
 from recon.camera.depth_mixture import (
     Mixture,
@@ -25,8 +26,6 @@ from recon.camera.registration import moved
 from recon.camera.varying_psfs import interpolation_weights
 from recon.errors import InputError
 from recon.types import Calibration
-
-Floats = npt.NDArray[np.float32]
 
 SAME_PLACE = 0.02
 """Places of two depths that differ by no more of the field were meant to be the same."""
@@ -103,7 +102,7 @@ def refocus_field(calibration: Calibration, z_um: float) -> Calibration:
     return _of_places(calibration, np.stack(made), positions)
 
 
-def _of_places(calibration: Calibration, psfs: Floats, positions: Any) -> Calibration:
+def _of_places(calibration: Calibration, psfs: Float32Array, positions: Any) -> Calibration:
     return replace(calibration, psfs=psfs, source_positions_um=np.array(positions, np.float64), quality={})
 
 
@@ -121,9 +120,9 @@ def _axis_at(calibration: Calibration, mixture: Mixture, z_um: float) -> tuple[f
 class _Side:
     """The photographs of one depth: ``points`` (n, 2), pixels by which each lies off the central one."""
 
-    psfs: Floats
-    points: npt.NDArray[np.float64]
-    places_um: npt.NDArray[np.float64]
+    psfs: Float32Array
+    points: Float64Array
+    places_um: Float64Array
 
     @classmethod
     def of(cls, calibration: Calibration, group: npt.NDArray[np.intp]) -> _Side:
@@ -132,7 +131,7 @@ class _Side:
         points = field.points - field.points[own]
         return cls(calibration.psfs[group], points, calibration.source_positions_um[group])
 
-    def at(self, points: npt.NDArray[np.float64]) -> _Side:
+    def at(self, points: Float64Array) -> _Side:
         """Return PSFs at other places, displaced by ``points``, from those around (Eq. 5.3)."""
         psfs = []
         for row, column in points:

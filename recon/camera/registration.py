@@ -11,17 +11,14 @@ without interpolation and its bias towards whole pixels.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
+from recon.arrays import Array
 from recon.base import fft
 from recon.base.blocks import block_mean
 from recon.camera.transformed import geometric_centre, resampled
 from recon.errors import InputError
-
-Array = npt.NDArray[Any]
 
 LOCAL_MEAN_PX = 8.0
 """Standard deviation of the Gaussian whose mean is taken off: structure much coarser does not count."""

@@ -22,9 +22,10 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from recon.arrays import Array
 from recon.base import fft
 from recon.base.threads import in_blocks
-from recon.camera.base import Array, LinearOperator, estimate_norm
+from recon.camera.base import LinearOperator, estimate_norm
 from recon.errors import InputError
 
 Window = tuple[slice, slice]

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-Floats = npt.NDArray[np.float32]
+from recon.arrays import BoolArray, Float32Array
 
 FINE_PX, MOST_PX = 700, 1400
 """Longer sides of images that are looked at on half pixels, and of the largest that are looked at."""
@@ -25,7 +25,9 @@ _WINDOW_PX, _LEVELS, _ROUNDS, _POLYNOMIAL_PX, _DEVIATION_PX = 7, 3, 3, 5, 1.1
 _BRIGHT = 0.999
 
 
-def met(first: Floats, second: Floats, share: float, shown: npt.NDArray[np.bool_]) -> tuple[Floats, Floats]:
+def met(
+    first: Float32Array, second: Float32Array, share: float, shown: BoolArray
+) -> tuple[Float32Array, Float32Array]:
     """Return two patterns (n_channels, height, width), both with their light moved to between them.
 
     As they are where that leaves them less alike by more than :data:`MOST_LOST`.
@@ -46,12 +48,12 @@ def met(first: Floats, second: Floats, share: float, shown: npt.NDArray[np.bool_
     return both if lost <= MOST_LOST * before else (first, second)
 
 
-def _likeness(first: Floats, second: Floats, shown: npt.NDArray[np.bool_]) -> float:
+def _likeness(first: Float32Array, second: Float32Array, shown: BoolArray) -> float:
     a, b = (image[:, shown].ravel() for image in (first, second))
     return float(a @ b) / max(float(np.linalg.norm(a)) * float(np.linalg.norm(b)), 1e-30)
 
 
-def _displacement(first: Floats, second: Floats) -> Floats:
+def _displacement(first: Float32Array, second: Float32Array) -> Float32Array:
     """Return (column, row) by which what is at each pixel of the first lies elsewhere in the second.
 
     By polynomials fitted about each pixel (G. Farnebäck, 2003).
@@ -63,7 +65,7 @@ def _displacement(first: Floats, second: Floats) -> Floats:
     factor = 2.0 if longer <= FINE_PX else min(1.0, MOST_PX / longer)
     bright = max(float(np.quantile(first, _BRIGHT)), 1e-30)
 
-    def seen(image: Floats) -> npt.NDArray[np.uint8]:
+    def seen(image: Float32Array) -> npt.NDArray[np.uint8]:
         smaller = cv2.INTER_AREA if factor < 1 else cv2.INTER_CUBIC
         sized = np.asarray(
             cv2.resize(image.astype(np.float32), None, fx=factor, fy=factor, interpolation=smaller)
@@ -78,7 +80,7 @@ def _displacement(first: Floats, second: Floats) -> Floats:
     return np.asarray(cv2.resize(flow, (width, height), interpolation=way) / factor, np.float32)
 
 
-def _moved(images: Floats, flow: Floats, spread: Floats, part: float) -> Floats:
+def _moved(images: Float32Array, flow: Float32Array, spread: Float32Array, part: float) -> Float32Array:
     """Return images read a part of the flow away; what is spread over more pixels is dimmer on each."""
     import cv2
 

@@ -3,15 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
+from recon.arrays import Array, Float32Array, Float64Array
 from recon.errors import InputError
-
-Array = npt.NDArray[Any]
-Floats = npt.NDArray[np.float32]
 
 LEAST_BLUR_PX = 0.1
 """Deviation of a Gaussian that takes out nothing worth the time."""
@@ -48,7 +45,7 @@ class Transformation:
             raise InputError(f"A scale is a positive number, not {self.scale}.")
 
     @property
-    def matrix(self) -> npt.NDArray[np.float64]:
+    def matrix(self) -> Float64Array:
         """The (2, 2) matrix that (row, column) from the centre is multiplied by before it is displaced."""
         turn = np.deg2rad(self.rotation_deg)
         rotation = np.array([[np.cos(turn), np.sin(turn)], [-np.sin(turn), np.cos(turn)]])
@@ -66,7 +63,7 @@ class Transformation:
         return ", ".join(said) or "as it is"
 
 
-def transformed(psfs: npt.ArrayLike, how: Transformation) -> Floats:
+def transformed(psfs: npt.ArrayLike, how: Transformation) -> Float32Array:
     """Return PSFs whose pattern is moved, and enlarged, turned, mirrored about the middle; float32.
 
     Every PSF keeps its light, but for what leaves the image; zeros come in. Cubic splines, and where the
@@ -86,12 +83,12 @@ def transformed(psfs: npt.ArrayLike, how: Transformation) -> Floats:
     return resampled(images, back, middle - back @ displaced) / np.float32(how.scale**2)
 
 
-def geometric_centre(image: Array) -> npt.NDArray[np.float64]:
+def geometric_centre(image: Array) -> Float64Array:
     """Return (row, column) of the middle of images (..., height, width)."""
     return (np.array(image.shape[-2:]) - 1) / 2
 
 
-def resampled(images: Array, matrix: npt.ArrayLike, offset: npt.NDArray[np.float64] | list[float]) -> Floats:
+def resampled(images: Array, matrix: npt.ArrayLike, offset: Float64Array | list[float]) -> Float32Array:
     """Return ``image(matrix v + offset)`` at every pixel ``v`` of images (..., height, width); float32.
 
     Parameters

@@ -7,16 +7,15 @@ from dataclasses import replace
 from itertools import product
 
 import numpy as np
-import numpy.typing as npt
 
+from recon.arrays import Float64Array
 from recon.camera.camera_model import members_of_depths
 from recon.camera.registration import shifted
 from recon.camera.transformed import geometric_centre
 from recon.errors import InputError
 from recon.types import Calibration
 
-Floats = npt.NDArray[np.float64]
-Response = Callable[[Floats, Floats], Floats]
+Response = Callable[[Float64Array, Float64Array], Float64Array]
 """Maps the tangents of the angle of incidence along y and x to a response relative to normal incidence."""
 
 LEAST_RESPONSE = 0.02
@@ -101,7 +100,9 @@ def is_cut(calibration: Calibration) -> bool:
     return False
 
 
-def _seen(response: Response, rows_um: Floats, columns_um: Floats, across_um: float) -> Floats:
+def _seen(
+    response: Response, rows_um: Float64Array, columns_um: Float64Array, across_um: float
+) -> Float64Array:
     """Light of a point that shines evenly on pixels at these places from below it."""
     tan_y, tan_x = rows_um[:, None] / across_um, columns_um / across_um
     return np.asarray(response(tan_y, tan_x) * (1 + tan_y**2 + tan_x**2) ** -1.5)

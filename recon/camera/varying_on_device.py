@@ -11,9 +11,10 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
+from recon.arrays import Array
 from recon.base import fft
 from recon.base.namespace import Namespace, namespace_of, to_host
-from recon.camera.base import Array, LinearOperator, estimate_norm
+from recon.camera.base import LinearOperator, estimate_norm
 from recon.camera.spatially_varying import Axis, Strip
 
 

@@ -14,19 +14,17 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from recon.arrays import Array, BoolArray, Float64Array
 from recon.base.namespace import Namespace
-from recon.camera.base import Array
 from recon.camera.convolution import field_of
 from recon.camera.spatially_varying import Part, SpatiallyVarying, Strip, Window
 from recon.camera.varying_on_device import VaryingOnDevice
 from recon.errors import InputError
 
-Floats = npt.NDArray[np.float64]
-
 
 def interpolation_weights(
     points: npt.ArrayLike, values: npt.ArrayLike, rows: npt.ArrayLike, columns: npt.ArrayLike
-) -> Floats:
+) -> Float64Array:
     """Interpolate values given at calibration points onto a grid of pixels.
 
     Bilinear between the four nearest where the points form a grid of rows and columns (spacings may differ),
@@ -54,7 +52,9 @@ def interpolation_weights(
     if axes is not None:
         grid_y, grid_x, order = axes
         table = v[order].reshape(len(grid_y), len(grid_x), -1)
-        result: Floats = np.einsum("ya,abn,xb->nyx", hats(grid_y, y), table, hats(grid_x, x), optimize=True)
+        result: Float64Array = np.einsum(
+            "ya,abn,xb->nyx", hats(grid_y, y), table, hats(grid_x, x), optimize=True
+        )
         return result
     return _scattered(p, v, y, x)
 
@@ -63,7 +63,7 @@ _OFF_LINE = 0.02
 """How far a point may be off its line, relative to the extent: stages repeat imperfectly."""
 
 
-def grid_axes(points: Floats) -> tuple[Floats, Floats, npt.NDArray[np.intp]] | None:
+def grid_axes(points: Float64Array) -> tuple[Float64Array, Float64Array, npt.NDArray[np.intp]] | None:
     """Return rows, columns and order of points that form a grid, or None where they do not."""
     lines = [_lines(points[:, axis]) for axis in (0, 1)]
     (y, row), (x, column) = lines
@@ -75,7 +75,7 @@ def grid_axes(points: Floats) -> tuple[Floats, Floats, npt.NDArray[np.intp]] | N
     return y, x, np.argsort(index)
 
 
-def _lines(positions: Floats) -> tuple[Floats, npt.NDArray[np.intp]]:
+def _lines(positions: Float64Array) -> tuple[Float64Array, npt.NDArray[np.intp]]:
     """Cluster positions into lines; return each line's mean and each position's line."""
     order = np.argsort(positions)
     gaps = np.diff(positions[order]) > _OFF_LINE * max(float(np.ptp(positions)), 1e-12)
@@ -85,7 +85,7 @@ def _lines(positions: Floats) -> tuple[Floats, npt.NDArray[np.intp]]:
     return means, label
 
 
-def hats(nodes: Floats, positions: Floats) -> Floats:
+def hats(nodes: Float64Array, positions: Float64Array) -> Float64Array:
     """Piecewise linear basis on ``nodes``, constant beyond the ends: (n_positions, n_nodes)."""
     return np.stack([np.interp(positions, nodes, unit) for unit in np.eye(len(nodes))], axis=1)
 
@@ -94,7 +94,7 @@ _BLOCK_VALUES = 2**17
 """Values that are interpolated at once: scipy needs several times the memory of what it returns."""
 
 
-def _scattered(points: Floats, values: Floats, y: Floats, x: Floats) -> Floats:
+def _scattered(points: Float64Array, values: Float64Array, y: Float64Array, x: Float64Array) -> Float64Array:
     from scipy.interpolate import LinearNDInterpolator, NearestNDInterpolator
     from scipy.spatial import QhullError
 
@@ -137,14 +137,14 @@ class FieldOfPsfs:
             )
 
     @cached_property
-    def products(self) -> Floats:
+    def products(self) -> Float64Array:
         """Products of the PSFs with one another, (n_points, n_points): their Gram matrix."""
         columns = self.psfs.reshape(len(self.psfs), -1)
-        gram: Floats = columns.astype(np.float64) @ columns.T.astype(np.float64)
+        gram: Float64Array = columns.astype(np.float64) @ columns.T.astype(np.float64)
         return gram
 
 
-def spanned(field: FieldOfPsfs, y: Array, x: Array, margin: float) -> npt.NDArray[np.bool_]:
+def spanned(field: FieldOfPsfs, y: Array, x: Array, margin: float) -> BoolArray:
     """Tell which object pixels (offsets from the axis) lie between a depth's outermost PSFs.
 
     ``margin`` is how far beyond them counts as well, in parts of the distance between them. One PSF spans
@@ -163,7 +163,7 @@ def local_convolution(
     fields: list[FieldOfPsfs],
     sensor_shape: tuple[int, int],
     *,
-    support: npt.NDArray[np.bool_] | None = None,
+    support: BoolArray | None = None,
     grid_shape: tuple[int, int] | None = None,
     dtype: npt.DTypeLike = np.float32,
     xp: Namespace = np,
@@ -195,21 +195,18 @@ def local_convolution(
         :class:`~recon.camera.convolution.Convolution`.
     """
 
-    def strips(z: int, field: FieldOfPsfs, needed: Mask, rows: Array, columns: Array) -> Iterator[Strip]:
+    def strips(z: int, field: FieldOfPsfs, needed: BoolArray, rows: Array, columns: Array) -> Iterator[Strip]:
         psfs, corner = cut_to_support(field.psfs)
         yield from _strips(z, psfs, field.points, rows, columns, needed, _offset(corner, field))
 
     return _model(fields, sensor_shape, strips, support, grid_shape, dtype, xp)
 
 
-Mask = npt.NDArray[np.bool_]
-
-
 def _model(
     fields: list[FieldOfPsfs],
     sensor_shape: tuple[int, int],
-    strips_of: Callable[[int, FieldOfPsfs, Mask, Array, Array], Iterator[Strip]],
-    support: Mask | None,
+    strips_of: Callable[[int, FieldOfPsfs, BoolArray, Array, Array], Iterator[Strip]],
+    support: BoolArray | None,
     grid_shape: tuple[int, int] | None,
     dtype: npt.DTypeLike,
     xp: Namespace,
@@ -253,13 +250,13 @@ def cut_to_support(psfs: Array) -> tuple[Array, tuple[int, int]]:
     return psfs[..., rows, columns], (rows.start, columns.start)
 
 
-def bounding_window(mask: Mask) -> Window:
+def bounding_window(mask: BoolArray) -> Window:
     """Return the smallest window that holds all of a mask, which must not be empty."""
     rows, columns = (np.asarray(mask.any(axis=axis)) for axis in (1, 0))
     return _span(rows), _span(columns)
 
 
-def within(mask: Mask, window: Window) -> Window | None:
+def within(mask: BoolArray, window: Window) -> Window | None:
     """Return the smallest window that holds a mask's part in ``window``; None where it has none."""
     inside = mask[window]
     if not inside.any():
@@ -272,7 +269,13 @@ def within(mask: Mask, window: Window) -> Window | None:
 
 
 def _strips(
-    z: int, psfs: Array, points: Array, rows: Array, columns: Array, needed: Mask, offset: tuple[int, int]
+    z: int,
+    psfs: Array,
+    points: Array,
+    rows: Array,
+    columns: Array,
+    needed: BoolArray,
+    offset: tuple[int, int],
 ) -> Iterator[Strip]:
     """Cut a depth into strips, and leave out what the support does not need."""
     axes = grid_axes(points)
@@ -303,7 +306,13 @@ def _span(weights: Array) -> slice:
 
 
 def _scattered_strips(
-    z: int, psfs: Array, points: Array, rows: Array, columns: Array, needed: Mask, offset: tuple[int, int]
+    z: int,
+    psfs: Array,
+    points: Array,
+    rows: Array,
+    columns: Array,
+    needed: BoolArray,
+    offset: tuple[int, int],
 ) -> Iterator[Strip]:
     weights = interpolation_weights(points, np.eye(len(points)), rows, columns)
     weights *= needed
@@ -334,7 +343,7 @@ class PrincipalPsfs:
     """
 
     components: Array
-    scores: npt.NDArray[np.float64]
+    scores: Float64Array
     error: float
 
 
@@ -375,7 +384,7 @@ def low_rank(
     *,
     rank: int | None = None,
     error: float | None = None,
-    support: npt.NDArray[np.bool_] | None = None,
+    support: BoolArray | None = None,
     grid_shape: tuple[int, int] | None = None,
     dtype: npt.DTypeLike = np.float32,
     xp: Namespace = np,
@@ -386,7 +395,7 @@ def low_rank(
     ``error`` as :func:`principal_psfs`. Depths that ``support`` does not touch are left out.
     """
 
-    def strips(z: int, field: FieldOfPsfs, needed: Mask, rows: Array, columns: Array) -> Iterator[Strip]:
+    def strips(z: int, field: FieldOfPsfs, needed: BoolArray, rows: Array, columns: Array) -> Iterator[Strip]:
         window = bounding_window(needed)
         principal = principal_psfs(field, rank=rank, error=error)
         psfs, corner = cut_to_support(principal.components)

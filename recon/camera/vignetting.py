@@ -10,9 +10,8 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import numpy as np
-import numpy.typing as npt
 
-Floats = npt.NDArray[np.float64]
+from recon.arrays import Float32Array, Float64Array
 
 STEPS, SETTLED, ENOUGH = 6, 0.05, 0.7
 """Gauss-Newton's at most, the share of the misfit by which the last one falls, and the mean square, in units
@@ -30,7 +29,7 @@ DEEPEST = 0.05
 """Least of a shade relative to its brightest place; one that comes to it is none."""
 
 
-def shade_of(numbers: Floats, shape: tuple[int, int]) -> npt.NDArray[np.float32]:
+def shade_of(numbers: Float64Array, shape: tuple[int, int]) -> Float32Array:
     """Return relative light on pixels, (height, width), 1 where it is brightest.
 
     Parameters
@@ -40,17 +39,19 @@ def shade_of(numbers: Floats, shape: tuple[int, int]) -> npt.NDArray[np.float32]
     shape : (int, int)
     """
     fallen = np.tensordot(numbers, _terms(shape), 1)
-    relative: npt.NDArray[np.float32] = np.maximum(np.exp(fallen.min() - fallen), DEEPEST).astype(np.float32)
+    relative: Float32Array = np.maximum(np.exp(fallen.min() - fallen), DEEPEST).astype(np.float32)
     return relative
 
 
-def _terms(shape: tuple[int, int]) -> Floats:
+def _terms(shape: tuple[int, int]) -> Float64Array:
     y, x = ((np.arange(n) - (n - 1) / 2) / (max(shape) / 2) for n in shape)
     rows, columns = np.meshgrid(y, x, indexing="ij")
     return np.stack([columns**2, rows**2, (columns**2 + rows**2) ** 2, columns, rows])
 
 
-def least_squares(left: Callable[[Floats], Floats], deepest: Callable[[Floats], bool]) -> Floats | None:
+def least_squares(
+    left: Callable[[Float64Array], Float64Array], deepest: Callable[[Float64Array], bool]
+) -> Float64Array | None:
     """Return the numbers of a shade of least mean square and penalty, by Levenberg's steps from none.
 
     None as soon as a step comes to a shade that is ``deepest``: it is none, however much it explains.

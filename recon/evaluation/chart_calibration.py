@@ -18,6 +18,7 @@ from typing import Any, Literal
 import numpy as np
 import numpy.typing as npt
 
+from recon.arrays import Array, Float32Array, Float64Array
 from recon.base.metrics import ssim
 from recon.blind import BlindSettings, calibrate_from_beads
 from recon.blind.points import support_of
@@ -30,8 +31,6 @@ from recon.reconstruction.reconstruct import reconstruct
 from recon.reconstruction.result import Reconstruction
 from recon.types import Calibration, Geometry
 
-Array = npt.NDArray[Any]
-Floats = npt.NDArray[np.float32]
 SceneName = Literal["flat picture", "beads at all depths"]
 SCENES: tuple[SceneName, SceneName] = ("flat picture", "beads at all depths")
 
@@ -47,9 +46,9 @@ class Photographed:
     """A scene's photograph and what is true."""
 
     name: SceneName
-    image: Floats
+    image: Float32Array
     """(height, width)."""
-    truth: Floats
+    truth: Float32Array
     """(FINE * height, FINE * width): light from all depths that reaches the sensor; the axis in the
     middle."""
 
@@ -58,12 +57,12 @@ class Photographed:
 class Photographs:
     """What a bench photographed; all of (height, width), float32, background removed, noise kept."""
 
-    psfs: Floats
+    psfs: Float32Array
     """(n, height, width): of the point source at ``places``, one photograph each; several of the same place
     differ in noise."""
-    places: npt.NDArray[np.float64]
+    places: Float64Array
     """(n, 3): row and column from the axis in object pixels, and depth in micrometres."""
-    slides: Floats
+    slides: Float32Array
     """(m, height, width): of beads at unknown places in depth ``z_um``."""
     scenes: tuple[Photographed, ...]
     z_um: float
@@ -248,7 +247,7 @@ class CalibrationProblem(Subject[CalibrationSetting]):
         places = np.column_stack([found.points, np.full(len(found.points), p.z_um)])
         return self._calibration(found.on_sensor(), places)
 
-    def _calibration(self, psfs: Floats, places: npt.NDArray[np.float64]) -> Calibration:
+    def _calibration(self, psfs: Float32Array, places: Float64Array) -> Calibration:
         """Give every PSF the light of its distance; places are rows, columns and depths."""
         p = self.photographs
         pitch, distance = p.geometry.pixel_pitch_um, p.geometry.diffuser_distance_mm
@@ -269,7 +268,7 @@ class CalibrationProblem(Subject[CalibrationSetting]):
             geometry=p.geometry,
         )
 
-    def _windowed(self, psf: Floats, row: float, column: float, z_um: float) -> Floats:
+    def _windowed(self, psf: Float32Array, row: float, column: float, z_um: float) -> Float32Array:
         """Cut a PSF to its window, and to where it has light above its noise."""
         p = self.photographs
         distance_um = 1e3 * (p.geometry.diffuser_distance_mm or 0.0)
@@ -288,7 +287,7 @@ class CalibrationProblem(Subject[CalibrationSetting]):
     def _at(self, row: float, column: float, z_um: float) -> npt.NDArray[np.int_]:
         return np.flatnonzero(np.all(np.abs(self.photographs.places - (row, column, z_um)) < 1e-6, axis=1))
 
-    def _depths_um(self) -> npt.NDArray[np.float64]:
+    def _depths_um(self) -> Float64Array:
         return np.unique(self.photographs.places[:, 2])
 
     def _grid(self) -> int:
@@ -308,7 +307,7 @@ class _OutOfTime(Exception):  # noqa: N818 (no error: the time limit of a blind 
     pass
 
 
-def coarse(truth: Floats, rows: int, columns: int) -> npt.NDArray[np.float64]:
+def coarse(truth: Float32Array, rows: int, columns: int) -> Float64Array:
     """Return a truth in the measurement's pixels, moved by so many of its own."""
     height, width = (n // FINE for n in truth.shape)
     # The pixel on the axis is the middle of FINE.
@@ -327,5 +326,5 @@ def _smooth(image: Array) -> Array:
     return np.asarray(gaussian_filter(image, 1.0))
 
 
-def _every(values: npt.NDArray[np.float64], count: int, middle: float) -> npt.NDArray[np.float64]:
+def _every(values: Float64Array, count: int, middle: float) -> Float64Array:
     return np.array([middle]) if count == 1 else values[:: (len(values) - 1) // (count - 1)]

@@ -10,11 +10,10 @@ from __future__ import annotations
 import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
+from recon.arrays import Array
 from recon.errors import InputError
 from recon.evaluation.scored import Aside, Curve, Point
 from recon.evaluation.trial import Subject
@@ -25,8 +24,6 @@ from recon.holography.optimise import HologramRecord, HologramStop, compute_holo
 from recon.holography.options import HologramOptions, Method
 from recon.holography.scores import compare
 from recon.holography.target import Target, foveal_weights
-
-Array = npt.NDArray[Any]
 
 LIGHTS = (0.7, 0.4, 0.2, 0.1, 0.03, 0.01)
 """What a complex SLM is charted at."""

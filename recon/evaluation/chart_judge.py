@@ -16,8 +16,8 @@ from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import numpy.typing as npt
 
+from recon.arrays import Array, BoolArray, Float64Array
 from recon.base import metrics
 from recon.base.blocks import block_mean, blocks_about_axis, enlarged
 from recon.camera.factors import BackgroundRemoval
@@ -35,7 +35,6 @@ from recon.types import Calibration
 if TYPE_CHECKING:
     from recon.evaluation.chart_reconstruction import ChartProblem
 
-Array = npt.NDArray[Any]
 
 HELD_SHARE = 0.05
 PARTS = 12
@@ -56,7 +55,7 @@ class Score:
     nrmse: float
 
 
-def score(found: npt.NDArray[Any], truth: npt.NDArray[Any], *, volume: bool | None = None) -> Score:
+def score(found: Array, truth: Array, *, volume: bool | None = None) -> Score:
     """Judge a reconstruction.
 
     Raises InputError when the shapes differ.
@@ -185,7 +184,7 @@ class Judge:
         return Part(Problem.of(measured, self.used, options), slice(0, 1))
 
 
-def _slow_waves(used: npt.NDArray[np.bool_]) -> BackgroundRemoval:
+def _slow_waves(used: BoolArray) -> BackgroundRemoval:
     """Return what takes slow waves out of an image (height, width), fitted where it was used."""
     rows, columns = (
         max(1, min(most, count // _PIXELS_A_WAVE))
@@ -194,7 +193,7 @@ def _slow_waves(used: npt.NDArray[np.bool_]) -> BackgroundRemoval:
     return BackgroundRemoval((1, *used.shape), (rows, columns), used, dtype=np.float64)
 
 
-def _misfit(seen: Array, shown: Array, waves: BackgroundRemoval) -> npt.NDArray[np.float64]:
+def _misfit(seen: Array, shown: Array, waves: BackgroundRemoval) -> Float64Array:
     """Return what a prediction misses at its best brightness, slow waves aside."""
     image, prediction = (np.asarray(a, np.float64)[None] for a in (seen, shown))
     shape = waves.forward(prediction)

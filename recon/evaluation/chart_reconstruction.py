@@ -11,11 +11,10 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cache, lru_cache
 from itertools import product
-from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
+from recon.arrays import Array, BoolArray, Float32Array
 from recon.base.namespace import Device, array_namespace
 from recon.base.noise import NoiseModel
 from recon.camera.camera_model import CAMERAS, MODELS, members_of_depths
@@ -33,8 +32,6 @@ from recon.reconstruction.solvers import SOLVERS
 from recon.solvers.base import IterationRecord, StopReason
 from recon.types import Calibration
 
-Array = npt.NDArray[Any]
-
 SCORES = 2
 """Version of how points are scored: those of another one do not compare."""
 COUNTS = (3, 5, 10, 20, 40, 80, 160, 320)
@@ -47,14 +44,14 @@ class ChartProblem(Subject[Setting]):
 
     kind = "reconstruction"
 
-    measurement: npt.NDArray[np.float32]
+    measurement: Float32Array
     """(height, width): one channel, counts, background subtracted."""
     calibration: Calibration
     volume: bool
     """Whether all depths take part; else the calibration holds one depth."""
-    erasures: npt.NDArray[np.bool_] | None = None
+    erasures: BoolArray | None = None
     noise: NoiseModel | float | None = None
-    truth: npt.NDArray[np.float32] | None = None
+    truth: Float32Array | None = None
     """(height, width), or (n_z, height, width)."""
 
     @classmethod

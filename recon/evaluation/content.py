@@ -7,15 +7,14 @@ place in depth from 0 (farthest) to 1 (nearest), evenly in 1/z as PSFs change; w
 from __future__ import annotations
 
 import numpy as np
-import numpy.typing as npt
 
-Floats = npt.NDArray[np.float64]
+from recon.arrays import Float64Array
 
 SUBSAMPLES = 3
 """Points along each side of a pixel of a picture: its edges lie between the pixels of any reconstruction."""
 
 
-def dense_picture(rng: np.random.Generator, side: int, density: float) -> Floats:
+def dense_picture(rng: np.random.Generator, side: int, density: float) -> Float64Array:
     """Leaves that cover each other, of all sizes and shades, over a slope: (side, side), 0 to 1.
 
     ``density`` is the number of leaves relative to the default.
@@ -37,7 +36,7 @@ def dense_picture(rng: np.random.Generator, side: int, density: float) -> Floats
     return np.asarray(np.clip(image, 0, 1))
 
 
-def sparse_picture(rng: np.random.Generator, side: int, density: float) -> Floats:
+def sparse_picture(rng: np.random.Generator, side: int, density: float) -> Float64Array:
     """Strokes and discs on black, (side, side), 0 to 1. ``density`` scales their number."""
     y, x = np.mgrid[:side, :side] / side - 0.5
     image = np.zeros((side, side))
@@ -52,7 +51,7 @@ def sparse_picture(rng: np.random.Generator, side: int, density: float) -> Float
     return image
 
 
-def text(rng: np.random.Generator, side: int, density: float) -> Floats:
+def text(rng: np.random.Generator, side: int, density: float) -> Float64Array:
     """Lines of letters of several sizes on black, (side, side), 0 to 1. ``density`` scales their number."""
     import cv2
 
@@ -71,7 +70,7 @@ def text(rng: np.random.Generator, side: int, density: float) -> Floats:
     return np.asarray(image / 255.0)
 
 
-def filaments(rng: np.random.Generator, side: int, density: float) -> Floats:
+def filaments(rng: np.random.Generator, side: int, density: float) -> Float64Array:
     """Bent threads on black, (side, side), 0 to 1. ``density`` scales their number."""
     import cv2
 
@@ -89,7 +88,7 @@ def filaments(rng: np.random.Generator, side: int, density: float) -> Floats:
     return image
 
 
-def gradient(rng: np.random.Generator, side: int, density: float) -> Floats:
+def gradient(rng: np.random.Generator, side: int, density: float) -> Float64Array:
     """Smooth shades with nowhere an edge, (side, side), 0 to 1. ``density`` scales how often they change."""
     y, x = np.mgrid[:side, :side] / side - 0.5
     image = rng.uniform(-1, 1) * y + rng.uniform(-1, 1) * x
@@ -100,7 +99,7 @@ def gradient(rng: np.random.Generator, side: int, density: float) -> Floats:
     return _from_0_to_1(image)
 
 
-def texture(rng: np.random.Generator, side: int, density: float) -> Floats:
+def texture(rng: np.random.Generator, side: int, density: float) -> Float64Array:
     """Noise whose amplitudes fall as one over the frequency, as in natural pictures, (side, side), 0 to 1.
 
     ``density`` makes them fall more slowly.
@@ -111,7 +110,7 @@ def texture(rng: np.random.Generator, side: int, density: float) -> Floats:
     return _from_0_to_1(np.fft.irfft2(spectrum)[:side, :side])
 
 
-def lights(rng: np.random.Generator, side: int, density: float) -> Floats:
+def lights(rng: np.random.Generator, side: int, density: float) -> Float64Array:
     """Small beads in one plane, on black, (side, side), 0 to 1. ``density`` scales their number."""
     image = np.zeros((side, side))
     radius = 0.008 * side
@@ -125,7 +124,7 @@ def lights(rng: np.random.Generator, side: int, density: float) -> Floats:
     return image
 
 
-def _from_0_to_1(image: Floats) -> Floats:
+def _from_0_to_1(image: Float64Array) -> Float64Array:
     low, high = image.min(), image.max()
     return np.asarray((image - low) / (high - low))
 
@@ -142,13 +141,13 @@ PICTURES = {
 """What draws a picture of each family: ``draw(rng, side, density)``."""
 
 
-def beads(rng: np.random.Generator, size: float, count: int) -> Floats:
+def beads(rng: np.random.Generator, size: float, count: int) -> Float64Array:
     """Beads anywhere in the volume, (count, 4), each as bright as 0.5 to 1.5."""
     places = rng.uniform(-0.42, 0.42, (count, 2)) * size
     return np.column_stack([places, rng.uniform(0.06, 0.94, count), rng.uniform(0.5, 1.5, count)])
 
 
-def dense_volume(rng: np.random.Generator, size: float, density: float) -> Floats:
+def dense_volume(rng: np.random.Generator, size: float, density: float) -> Float64Array:
     """Tilted sheets with holes, thick blobs and threads that fill much of the volume, (n, 4)."""
     step = 0.5
     parts = []
@@ -166,7 +165,7 @@ def dense_volume(rng: np.random.Generator, size: float, density: float) -> Float
     return np.concatenate(parts)
 
 
-def tissue(rng: np.random.Generator, size: float, density: float) -> Floats:
+def tissue(rng: np.random.Generator, size: float, density: float) -> Float64Array:
     """Cell bodies and the threads between them, (n, 4): what fluoresces under a microscope."""
     count = max(round(14 * density), 2)
     bodies = _blobs(rng, size, count, 0.028)
@@ -181,7 +180,7 @@ def tissue(rng: np.random.Generator, size: float, density: float) -> Floats:
     return np.concatenate(parts)
 
 
-def _blobs(rng: np.random.Generator, size: float, count: int, radius: float) -> Floats:
+def _blobs(rng: np.random.Generator, size: float, count: int, radius: float) -> Float64Array:
     """Fill balls with random points: a radius of about ``radius * size`` pixels, and some thickness."""
     parts = []
     for _ in range(count):

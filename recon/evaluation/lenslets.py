@@ -16,7 +16,8 @@ import numpy as np
 import numpy.typing as npt
 from numba import njit
 
-Floats = npt.NDArray[np.float64]
+from recon.arrays import Float32Array, Float64Array
+
 Optics = Literal["random", "regular", "smooth"]
 
 SPOT_PX = 0.7
@@ -79,7 +80,7 @@ class LensletCamera:
     pitch_um: float
     distance_um: float
     """``pitch_um`` and ``distance_um``: of the pixels, and from the diffuser to the sensor."""
-    facets: Floats
+    facets: Float64Array
     """(n, 5): ``y, x`` in the diffuser's plane (micrometres), deflection in tangents along y and x,
     transmitted share of the light."""
     facet_um: float
@@ -95,7 +96,7 @@ class LensletCamera:
     spot_px: float = SPOT_PX
     """Deviation of spots in best focus."""
 
-    def light(self, points: npt.ArrayLike, channel: int = 1) -> npt.NDArray[np.float32]:
+    def light(self, points: npt.ArrayLike, channel: int = 1) -> Float32Array:
         """Return the light of points ``(x, y, z, power)``, (n, 4), micrometres, on the sensor.
 
         A point of power 1 at the depth of focus on the axis sends a light of about 1 through the aperture.
@@ -173,7 +174,7 @@ def build_camera(
     )
 
 
-def _smooth_tilts(rng: np.random.Generator, side: int) -> Floats:
+def _smooth_tilts(rng: np.random.Generator, side: int) -> Float64Array:
     """Gradient of a smooth random surface on a lattice, (side * side, 2), of unit root mean square."""
     from scipy.ndimage import gaussian_filter
 

@@ -4,14 +4,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from recon.analysis.gram import WindowProblem, condition_number
 from recon.analysis.point_noise import Noise
 from recon.analysis.points import DIP, PointGrid, try_points
+from recon.arrays import Array, Float32Array
 from recon.camera.base import LinearOperator
 from recon.camera.convolution import Convolution
 from recon.evaluation.lenslets import LensletCamera, build_camera
@@ -45,8 +44,6 @@ from recon.verdict.map import (
     convergence_severity,
     relative_error,
 )
-
-Array = npt.NDArray[Any]
 
 # Solvers by themselves --------------------------------------------------------------------------------
 STEPS = 100
@@ -157,7 +154,7 @@ def _camera(seed: int) -> LensletCamera:
     return build_camera(CAMERA_PX, optics="smooth", seed=seed, focus=CAMERA_DEPTH)
 
 
-def point_image(camera: LensletCamera, columns: float) -> npt.NDArray[np.float32]:
+def point_image(camera: LensletCamera, columns: float) -> Float32Array:
     """Return the image of a point ``columns`` pixels from the axis at the tests' depth."""
     z_um = CAMERA_DEPTH * camera.distance_um
     return camera.light([[-columns * camera.pitch_um * z_um / camera.distance_um, 0.0, z_um, 1.0]])

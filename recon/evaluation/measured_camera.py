@@ -13,14 +13,15 @@ from functools import lru_cache
 import numpy as np
 import numpy.typing as npt
 
+from recon.arrays import Float32Array, Float64Array
 from recon.base import fft
 from recon.base.blocks import block_sum
 from recon.camera.transformed import Transformation, transformed
 from recon.errors import InputError
 from recon.evaluation.lenslets import DISTANCE, PITCH_UM
-from recon.evaluation.measured_sets import Floats, MeasuredSet, measured_set
+from recon.evaluation.measured_sets import MeasuredSet, measured_set
 
-Points = npt.NDArray[np.float64]
+Points = Float64Array
 
 SUBPIXELS = 6
 """Fine pixels along each side of the sensor's, at most."""
@@ -39,7 +40,7 @@ class MeasuredCamera:
     """``(height, width)`` of the sensor in pixels; pixel ``(height // 2, width // 2)`` lies on the axis."""
     pitch_um: float
     distance_um: float
-    psfs: Floats
+    psfs: Float32Array
     """(n_z, fine height, fine width): the nearest first; the middle one has a light of 1."""
     inverse_depths: tuple[float, float]
     """1/z of the nearest and the farthest PSF, per micrometre; those between are even in 1/z."""
@@ -57,7 +58,7 @@ class MeasuredCamera:
         """Fine pixels along each side of the sensor's."""
         return int(self.psfs.shape[1] // self.shape[0])
 
-    def light(self, points: npt.ArrayLike, channel: int = 1) -> Floats:
+    def light(self, points: npt.ArrayLike, channel: int = 1) -> Float32Array:
         """Return the light of points ``(x, y, z, power)``, (n, 4), micrometres, on the sensor.
 
         ``channel`` is 0 for red, 1 for green, 2 for blue.
@@ -99,7 +100,7 @@ class MeasuredCamera:
         shares = [np.maximum(1 - np.abs(at - k), 0) for k in range(RINGS)]
         return [(1 + self.aberration * most * k / (RINGS - 1), share) for k, share in enumerate(shares)]
 
-    def _psf(self, plane: int, growth: float) -> Floats:
+    def _psf(self, plane: int, growth: float) -> Float32Array:
         drift, k = self.drift, self.subpixels
         how = Transformation(drift.rows * k, drift.columns * k, drift.scale * growth, drift.rotation_deg)
         psf = self.psfs[plane]
@@ -168,7 +169,7 @@ def smooth_light(of: MeasuredSet, shape: tuple[int, int]) -> Points:
 
 
 @lru_cache(maxsize=4)
-def _fine_psfs(of: MeasuredSet, shape: tuple[int, int]) -> Floats:
+def _fine_psfs(of: MeasuredSet, shape: tuple[int, int]) -> Float32Array:
     """Return a set's PSFs cut to a sensor's shape, on as many finer pixels as there are, 6 at most."""
     psfs, _ = measured_set(of)
     height, width = psfs.shape[1:]

@@ -13,11 +13,10 @@ from pathlib import Path
 from typing import Literal, get_args
 
 import numpy as np
-import numpy.typing as npt
 
+from recon.arrays import Float32Array
 from recon.errors import InputError
 
-Floats = npt.NDArray[np.float32]
 MeasuredSet = Literal["hand", "usaf"]
 MEASURED: tuple[MeasuredSet, ...] = get_args(MeasuredSet)
 HAND_DARK = np.s_[5:15, 5:15]
@@ -32,7 +31,7 @@ def data_folder() -> Path:
 
 
 @lru_cache(maxsize=2)
-def measured_set(name: MeasuredSet) -> tuple[Floats, Floats]:
+def measured_set(name: MeasuredSet) -> tuple[Float32Array, Float32Array]:
     """Return a set's PSFs and its photograph, black level subtracted; not to be written to.
 
     Raises InputError when the set is not there.
@@ -50,7 +49,7 @@ def measured_set(name: MeasuredSet) -> tuple[Floats, Floats]:
 
 
 @lru_cache(maxsize=1)
-def measured_pairs() -> tuple[tuple[str, ...], Floats, Floats]:
+def measured_pairs() -> tuple[tuple[str, ...], Float32Array, Float32Array]:
     """Return names, photographs through the diffuser and the pictures they show; not to be written to.
 
     Raises InputError when the set is not there.
@@ -82,14 +81,14 @@ def _found(folder: Path, pattern: str) -> list[Path]:
     return files
 
 
-def _files(folder: Path, pattern: str) -> list[Floats]:
+def _files(folder: Path, pattern: str) -> list[Float32Array]:
     import cv2
 
     found = _found(folder, pattern)
     return [np.asarray(cv2.imread(str(file), cv2.IMREAD_UNCHANGED), np.float32) for file in found]
 
 
-def _hand(root: Path) -> tuple[Floats, Floats]:
+def _hand(root: Path) -> tuple[Float32Array, Float32Array]:
     folder = root / "diffusercam_hand"
     psf, photograph = (
         image - image[HAND_DARK].mean()
@@ -99,9 +98,12 @@ def _hand(root: Path) -> tuple[Floats, Floats]:
     return np.maximum(psf, 0)[None], photograph
 
 
-def _usaf(root: Path) -> tuple[Floats, Floats]:
+def _usaf(root: Path) -> tuple[Float32Array, Float32Array]:
     folder = root / "diffusercam_usaf3d"
     return np.stack(_files(folder, "psf*.tiff")), _files(folder, "image.tiff")[0] - USAF_BLACK
 
 
-_READERS: Mapping[MeasuredSet, Callable[[Path], tuple[Floats, Floats]]] = {"hand": _hand, "usaf": _usaf}
+_READERS: Mapping[MeasuredSet, Callable[[Path], tuple[Float32Array, Float32Array]]] = {
+    "hand": _hand,
+    "usaf": _usaf,
+}

@@ -14,8 +14,8 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
-import numpy.typing as npt
 
+from recon.arrays import Float32Array, Float64Array
 from recon.base import metrics
 from recon.base.declare import option
 from recon.optics.diffuser import OPTICAL_EPOXY, Diffuser, microlens_diffuser, smooth_diffuser
@@ -27,8 +27,6 @@ from recon.optics.wave import Emission, Source, WavePropagator
 from recon.reconstruction.options import Options
 from recon.reconstruction.reconstruct import reconstruct
 from recon.types import Calibration, Geometry
-
-Image = npt.NDArray[np.float32]
 
 SHAPE, PITCH_UM = (111, 111), 20.0
 """Odd: the axis meets the middle of a pixel. A spot on the corner of four is a square of four."""
@@ -86,12 +84,12 @@ class Compared:
         Share of the volume's light that is where beads are: in a bead's plane, a pixel from it at most.
     """
 
-    psfs: Image
-    photograph: Image
-    bead_photograph: Image
-    pictures: Mapping[float, Image]
+    psfs: Float32Array
+    photograph: Float32Array
+    bead_photograph: Float32Array
+    pictures: Mapping[float, Float32Array]
     psnr_db: Mapping[float, float]
-    volume: Image
+    volume: Float32Array
     volume_psnr_db: float
     light_in_place: float
 
@@ -101,8 +99,8 @@ class Comparison:
     """All optics, by :data:`OPTICS`, with the scenes: the picture, and the beads by plane."""
 
     found: Mapping[str, Compared]
-    picture: Image
-    beads: Image
+    picture: Float32Array
+    beads: Float32Array
 
 
 def compare_optics(
@@ -179,7 +177,7 @@ class _Corrected(WavePropagator):
         diameter_um: float = 0.0,
         emission: Emission = "lambertian",
         cell: bool = False,
-    ) -> Image:
+    ) -> Float32Array:
         """Return the light of a point on the axis, moved to where the straight ray ends."""
         x, y, z = source_um
         moved = (grid.center_um[0] + x * self.distance_um / z, grid.center_um[1] + y * self.distance_um / z)
@@ -210,7 +208,7 @@ def _diffuser(name: str, seed: int) -> Diffuser:
     return Diffuser((heights - heights.mean()).astype(np.float32), _HEIGHTS_UM, size, OPTICAL_EPOXY)
 
 
-def _spokes() -> npt.NDArray[np.float64]:
+def _spokes() -> Float64Array:
     """Draw eight bright spokes on black, (72, 72)."""
     n = 72
     y, x = np.mgrid[:n, :n] - (n - 1) / 2
@@ -228,27 +226,29 @@ def _onto_depths(scene: Scene) -> Scene:
     return Scene(scene.name, beads=(replace(beads, positions_um=places),))
 
 
-def _truth(scene: Scene, plane: int | None) -> Image:
+def _truth(scene: Scene, plane: int | None) -> Float32Array:
     ranges = {} if plane is None else {"z_range_um": (0.99 * DEPTHS_UM[plane], 1.01 * DEPTHS_UM[plane])}
     grid = TruthGrid(SHAPE, PITCH_UM, DISTANCE_UM)
     return np.asarray(scene.true_image(grid, _WEIGHTS, **ranges), np.float32)
 
 
-def _photographed(scene: Scene, grid: PixelGrid, light: WavePropagator) -> Image:
+def _photographed(scene: Scene, grid: PixelGrid, light: WavePropagator) -> Float32Array:
     return render(scene, _WEIGHTS, grid, light, no_fall_off, layer_photons=1, bead_photons=1, settings=_NODES)
 
 
-def _noisy(clean: Image, photons: float, rng: np.random.Generator) -> Image:
+def _noisy(clean: Float32Array, photons: float, rng: np.random.Generator) -> Float32Array:
     counts = rng.poisson(clean.astype(np.float64) * (photons / float(clean.sum())))
     return np.asarray(counts + rng.normal(0, READ_NOISE_E, clean.shape), np.float32)
 
 
-def _calibration(psfs: Image) -> Calibration:
+def _calibration(psfs: Float32Array) -> Calibration:
     places = np.array([(0.0, 0.0, z) for z in DEPTHS_UM])
     return Calibration(psfs[:, None], places, geometry=Geometry(PITCH_UM, DISTANCE_UM / 1e3))
 
 
-def _solved(counts: Image, calibration: Calibration, iterations: int, truth: Image) -> tuple[Image, float]:
+def _solved(
+    counts: Float32Array, calibration: Calibration, iterations: int, truth: Float32Array
+) -> tuple[Float32Array, float]:
     """Return what comes next to the truth by one of the weights, and its PSNR in dB."""
     wanted = Options(model="convolution", prior="l1", iterations=iterations, judged=False)
     default = reconstruct(counts, calibration, options=replace(wanted, iterations=1)).tau or 0.0
@@ -259,7 +259,7 @@ def _solved(counts: Image, calibration: Calibration, iterations: int, truth: Ima
     return max(found, key=lambda one: one[1])
 
 
-def _light_in_place(volume: Image, truth: Image) -> float:
+def _light_in_place(volume: Float32Array, truth: Float32Array) -> float:
     """Share of the light that is a pixel at most from a bead, in its plane."""
     lit = truth > 0.1 * truth.max()
     near = np.zeros_like(lit)

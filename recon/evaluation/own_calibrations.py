@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from recon.arrays import Float64Array
 from recon.camera.camera_model import ModelName, members_of_depths
 from recon.camera.varying_psfs import grid_axes
 from recon.errors import InputError
@@ -178,7 +179,7 @@ def _parts(own: OwnCalibration) -> list[OwnSetting]:
 def _which(
     chosen: list[Members],
     depths: list[Members],
-    positions: npt.NDArray[np.float64],
+    positions: Float64Array,
 ) -> str:
     """Say at which of several depths; of a single one its number too: z may be unknown, or the steps fine."""
     if len(depths) == 1:

@@ -10,18 +10,16 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
-import numpy.typing as npt
 
 from recon.analysis.middle import Middle
 from recon.analysis.point_images import PLANES, planes_about
 from recon.analysis.point_noise import Noise
 from recon.analysis.points import DIP, PointGrid, smallest_dip
 from recon.analysis.stated_distance import InVolumes, TriedPair, stated_px
+from recon.arrays import Float64Array
 from recon.evaluation.two_points import cells, shifted
 from recon.reconstruction.reconstruct import reconstruct
 from recon.types import Calibration
-
-Floats = npt.NDArray[np.float64]
 
 CELL_PX = 30
 """For a group of points, at least."""
@@ -38,14 +36,16 @@ class _Volume:
     """A default volume of planes half a step apart."""
 
     middle: Middle
-    inverse: Floats
+    inverse: Float64Array
     """1 / z of its planes, the nearest first."""
     noise: Noise
 
     def depth_um(self, plane: float) -> float:
         return float(1 / np.interp(plane, np.arange(len(self.inverse)), self.inverse))
 
-    def told_apart(self, grids: list[PointGrid], places: Floats, rng: np.random.Generator) -> list[bool]:
+    def told_apart(
+        self, grids: list[PointGrid], places: Float64Array, rng: np.random.Generator
+    ) -> list[bool]:
         """Photograph groups in their cells, reconstruct, and tell which are told apart."""
         psfs = np.stack([self.middle.psf_at(float(1 / v)) for v in self.inverse])
         height, width = psfs.shape[1:]
@@ -149,5 +149,5 @@ def in_volumes(
     return InVolumes(None if along is None else along * axial_per_um, sixteen, PLANES, middle.part)
 
 
-def _about_zero(count: int) -> Floats:
+def _about_zero(count: int) -> Float64Array:
     return np.asarray(np.arange(count) - (count - 1) / 2, np.float64)

@@ -8,10 +8,11 @@ from typing import Any, Literal, cast, get_args
 import numpy as np
 import numpy.typing as npt
 
+from recon.arrays import BoolArray, Float32Array, Float64Array
 from recon.base.noise import NoiseModel
 from recon.errors import InputError
 from recon.evaluation import content
-from recon.evaluation.lenslets import SPOT_PX, Floats, LensletCamera, Optics, build_camera
+from recon.evaluation.lenslets import SPOT_PX, LensletCamera, Optics, build_camera
 from recon.evaluation.measured_camera import MeasuredCamera, measured_camera, smooth_light
 from recon.evaluation.measured_sets import MEASURED, MeasuredSet
 from recon.types import Calibration, Geometry
@@ -142,26 +143,26 @@ class TestScene:
     __test__ = False  # not a pytest class, whatever its name
 
     spec: SceneSpec
-    measurement: npt.NDArray[np.float32]
+    measurement: Float32Array
     """(height, width) or (height, width, 3): counts, one a photo-electron; 0 where erased."""
     calibration: Calibration
     """With noise, at ``depths`` times ``grid`` squared places."""
-    truth: npt.NDArray[np.float32]
+    truth: Float32Array
     """(height, width) or (n_z, height, width) with the calibration's depths, and channels last where there
     are some: in units in which ``measurement = sum PSF * truth`` with the PSFs as calibrated."""
-    erasures: npt.NDArray[np.bool_] | None
+    erasures: BoolArray | None
     """(height, width): true where a pixel was not read."""
     noise: NoiseModel
     """The sensor's."""
-    background: npt.NDArray[np.float32]
+    background: Float32Array
     """as ``measurement``: the true stray light, counts."""
     camera: Camera
     """As it was when the measurement was taken."""
-    points: Floats
+    points: Float64Array
     """(n, 4): ``x, y, z`` in micrometres and power."""
 
     @property
-    def z_um(self) -> Floats:
+    def z_um(self) -> Float64Array:
         """Depths of the calibrated planes, the nearest first."""
         return np.unique(self.calibration.source_positions_um[:, 2])
 
@@ -239,7 +240,7 @@ def _camera(spec: SceneSpec, seed: int) -> Camera:
     )
 
 
-def _places(spec: SceneSpec, rng: np.random.Generator) -> Floats:
+def _places(spec: SceneSpec, rng: np.random.Generator) -> Float64Array:
     """Rows, columns (picture pixels from the axis), places in depth and brightness, (n, 4)."""
     side = max(spec.shape)
     if spec.is_picture:
@@ -262,7 +263,7 @@ def _places(spec: SceneSpec, rng: np.random.Generator) -> Floats:
     return places
 
 
-def _tints(spec: SceneSpec, places: Floats, rng: np.random.Generator) -> Floats:
+def _tints(spec: SceneSpec, places: Float64Array, rng: np.random.Generator) -> Float64Array:
     """Brightness of every point in every channel, relative to its own, (n, channels)."""
     if spec.channels == 1 or not spec.colourful:
         return np.ones((len(places), spec.channels))
@@ -273,30 +274,30 @@ def _tints(spec: SceneSpec, places: Floats, rng: np.random.Generator) -> Floats:
     return np.asarray(colours[nearest])
 
 
-def _channels(spec: SceneSpec, tints: Floats) -> list[tuple[int, Floats]]:
+def _channels(spec: SceneSpec, tints: Float64Array) -> list[tuple[int, Float64Array]]:
     """Return the camera's colours, each with every point's tint in it."""
     return [(1, tints[:, 0])] if spec.channels == 1 else [(c, tints[:, c]) for c in range(3)]
 
 
-def _points(spec: SceneSpec, places: Floats, camera: Camera) -> Floats:
+def _points(spec: SceneSpec, places: Float64Array, camera: Camera) -> Float64Array:
     """``x, y, z`` and power of every point, (n, 4)."""
     z = _depth_um(spec, places[:, 2], camera.distance_um)
     to_scene = -camera.pitch_um * z / camera.distance_um
     return np.column_stack([places[:, 1] * to_scene, places[:, 0] * to_scene, z, places[:, 3]])
 
 
-def _depth_um(spec: SceneSpec, place: npt.ArrayLike, distance_um: float) -> Floats:
+def _depth_um(spec: SceneSpec, place: npt.ArrayLike, distance_um: float) -> Float64Array:
     """Depth of a place between far (0) and near (1), even in 1/z."""
     inverse = 1 / spec.z_far + np.asarray(place) * (1 / spec.z_near - 1 / spec.z_far)
     return distance_um / inverse
 
 
-def _plane_places(spec: SceneSpec) -> Floats:
+def _plane_places(spec: SceneSpec) -> Float64Array:
     """Places of the calibrated planes, the nearest first."""
     return np.linspace(1.0, 0.0, spec.depths) if spec.depths > 1 else np.array([0.5])
 
 
-def _stray_light(spec: SceneSpec, rng: np.random.Generator) -> Floats:
+def _stray_light(spec: SceneSpec, rng: np.random.Generator) -> Float64Array:
     """Smooth light of mean ``spec.background``: a slope and a broad hill, or as a photograph has it."""
     if spec.optics in MEASURED:
         light = smooth_light(spec.optics, spec.shape)
@@ -343,7 +344,7 @@ def _calibrate(spec: SceneSpec, camera: Camera, rng: np.random.Generator) -> tup
     return calibration, unit
 
 
-def _on_grid(spec: SceneSpec, places: Floats, tint: Floats) -> Floats:
+def _on_grid(spec: SceneSpec, places: Float64Array, tint: Float64Array) -> Float64Array:
     """Brightness of every pixel or voxel.
 
     In a volume every point's light is shared by its eight nearest voxels; a picture's points lie so densely
@@ -360,7 +361,7 @@ def _on_grid(spec: SceneSpec, places: Floats, tint: Floats) -> Floats:
     return shared((spec.depths, height, width), np.column_stack([depth, row, column]), light)
 
 
-def shared(shape: tuple[int, ...], places: Floats, light: Floats) -> Floats:
+def shared(shape: tuple[int, ...], places: Float64Array, light: Float64Array) -> Float64Array:
     """Return points (n, n_axes) on a grid, each shared by its nearest cells, two along each axis."""
     grid = np.zeros(shape)
     corner = np.floor(places).astype(int)
@@ -370,12 +371,12 @@ def shared(shape: tuple[int, ...], places: Floats, light: Floats) -> Floats:
     return grid
 
 
-def _drop(grid: Floats, cells: npt.NDArray[np.int_], light: Floats) -> None:
+def _drop(grid: Float64Array, cells: npt.NDArray[np.int_], light: Float64Array) -> None:
     """Add light to cells, (n, n_axes); what falls outside is lost."""
     inside = ((cells >= 0) & (cells < grid.shape)).all(axis=1)
     np.add.at(grid, tuple(cells[inside].T), light[inside])
 
 
-def _flat(array: Floats) -> npt.NDArray[np.float32]:
+def _flat(array: Float64Array) -> Float32Array:
     """Channels last, left out where there is one."""
     return np.ascontiguousarray(array[..., 0] if array.shape[-1] == 1 else array, np.float32)

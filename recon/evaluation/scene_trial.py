@@ -25,10 +25,10 @@ from functools import lru_cache
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from recon.analysis.correlation import RESOLUTION_LEVEL
 from recon.analysis.resolution import axial_resolution, lateral_resolution
+from recon.arrays import Array, BoolArray, Float64Array
 from recon.camera.camera_model import ModelName
 from recon.camera.depth_mixture import central_psfs
 from recon.errors import InputError
@@ -54,9 +54,7 @@ from recon.verdict.map import (
     trivial_error,
 )
 
-Image = npt.NDArray[Any]
-Floats = npt.NDArray[np.float64]
-Chosen = npt.NDArray[np.bool_]
+Chosen = BoolArray
 
 PIXELS: Mapping[Size, int] = {"quick": 48, "full": 64}
 LEAST_RESOLVED_PX = 2.0
@@ -160,7 +158,7 @@ def _convergence(result: Reconstruction) -> float:
     )
 
 
-def judge_image(scene: TestScene, found: Image, truth: Image) -> tuple[float, Severities]:
+def judge_image(scene: TestScene, found: Array, truth: Array) -> tuple[float, Severities]:
     """Return error and severities of a picture or volume (n_z, height, width)."""
     from scipy.ndimage import gaussian_filter
 
@@ -183,7 +181,7 @@ def judge_image(scene: TestScene, found: Image, truth: Image) -> tuple[float, Se
     return error, severities
 
 
-def back_projection(scene: TestScene, psf: Image) -> Image:
+def back_projection(scene: TestScene, psf: Array) -> Array:
     """Return ``A^H b``, (n_z, height, width): the measurement correlated with each depth's PSF."""
     from scipy.signal import fftconvolve
 
@@ -196,7 +194,7 @@ def back_projection(scene: TestScene, psf: Image) -> Image:
     return np.stack([f[top : top + height, left : left + width] for f in full])
 
 
-def _depth_reach(scene: TestScene, psf: Image) -> float:
+def _depth_reach(scene: TestScene, psf: Array) -> float:
     """Return the axial resolution in planes, at least the lateral reach."""
     if len(psf) < 2:
         return REACH_PX
@@ -208,7 +206,7 @@ def _depth_reach(scene: TestScene, psf: Image) -> float:
     return max(REACH_PX, step / spacing) if np.isfinite(step) else REACH_PX
 
 
-def _places(scene: TestScene, n_z: int) -> Floats:
+def _places(scene: TestScene, n_z: int) -> Float64Array:
     """Plane, row and column of every point."""
     camera, points = scene.camera, scene.points
     inverse = 1 / scene.z_um
@@ -231,9 +229,9 @@ def spec_at(base: SceneSpec, size: Size, seed: int, **changes: Any) -> SceneSpec
 
 # Points lost or made up -----------------------------------------------------------------------------
 def spot_severity(
-    found: Image,
-    truth: Image,
-    places: Floats,
+    found: Array,
+    truth: Array,
+    places: Float64Array,
     *,
     resolved_px: float,
     reach_planes: float = REACH_PX,
@@ -278,11 +276,11 @@ def spot_severity(
 
 
 def _wrong(
-    peaks: Floats,
-    heights: Floats,
-    places: Floats,
+    peaks: Float64Array,
+    heights: Float64Array,
+    places: Float64Array,
     asked: Chosen,
-    crowded: tuple[Floats, Chosen] | None = None,
+    crowded: tuple[Float64Array, Chosen] | None = None,
 ) -> float:
     """Return the severity of points on their own, or of ``crowded`` ones less what chance would give.
 
@@ -306,7 +304,7 @@ def _wrong(
     return max(lost, made_up / empty if empty > 0 else 0.0) / LOST_SHARE
 
 
-def _peaks(image: Image) -> tuple[Floats, Floats]:
+def _peaks(image: Array) -> tuple[Float64Array, Float64Array]:
     """Return places (n, 3) and heights of the local maxima."""
     from scipy.ndimage import gaussian_filter, maximum_filter
 
@@ -315,18 +313,18 @@ def _peaks(image: Image) -> tuple[Floats, Floats]:
     return at.astype(np.float64), smooth[tuple(at.T)]
 
 
-def _highest_within_reach(peaks: Floats, heights: Floats, places: Floats) -> Floats:
+def _highest_within_reach(peaks: Float64Array, heights: Float64Array, places: Float64Array) -> Float64Array:
     """Return the height of every place's highest peak within reach; 0 for none."""
     distance = np.abs(places[:, None, :] - peaks[None]).max(axis=2)
     return np.asarray(np.where(distance <= REACH_PX, heights[None], 0).max(axis=1))
 
 
-def _least(nearest: Floats, asked: Chosen) -> float:
+def _least(nearest: Float64Array, asked: Chosen) -> float:
     """Return the height from which a peak counts; 0 where most points have none."""
     return PEAK_SHARE * float(np.median(nearest[asked])) if asked.any() else 0.0
 
 
-def _distance(places: Floats, others: Floats) -> Floats:
+def _distance(places: Float64Array, others: Float64Array) -> Float64Array:
     """Return the distance of every place from the nearest of the others, the largest along any axis."""
     from scipy.spatial import cKDTree
 
@@ -334,14 +332,14 @@ def _distance(places: Floats, others: Floats) -> Floats:
     return np.asarray(distance)
 
 
-def _field(places: Floats) -> Floats:
+def _field(places: Float64Array) -> Float64Array:
     """Return the voxels, (n, 3), of the box that holds all points."""
     low, high = np.floor(places.min(axis=0)), np.ceil(places.max(axis=0))
     axes = [np.arange(a, b + 1) for a, b in zip(low, high, strict=True)]
     return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
 
 
-def _apart(places: Floats, across_px: float, planes: float) -> Chosen:
+def _apart(places: Float64Array, across_px: float, planes: float) -> Chosen:
     """Points without another one nearer than both distances."""
     if len(places) < 2:
         return np.ones(len(places), bool)

@@ -14,8 +14,8 @@ from dataclasses import dataclass, replace
 from typing import Any, ClassVar, Generic, Protocol, TypeVar
 
 import numpy as np
-import numpy.typing as npt
 
+from recon.arrays import Array
 from recon.base.namespace import Device
 from recon.camera.camera_model import CAMERAS
 from recon.errors import InputError
@@ -208,7 +208,7 @@ class Subject(ABC, Generic[S]):
         """Run a setting once in small, so that what it needs is loaded and compiled."""
 
     @abstractmethod
-    def _identity(self) -> Iterable[str | npt.NDArray[Any] | None]:
+    def _identity(self) -> Iterable[str | Array | None]:
         """Yield all that scores depend on."""
 
     def fingerprint(self) -> str:

@@ -14,10 +14,8 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
 from itertools import product
-from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from recon.analysis.correlation import lit_extent
 from recon.analysis.middle import Middle
@@ -25,14 +23,12 @@ from recon.analysis.point_noise import Noise
 from recon.analysis.points import DIP, smallest_dip
 from recon.analysis.stated_distance import NEARER, Reached, TriedPair
 from recon.analysis.told_apart import Told, stated_apart
+from recon.arrays import Array, Float64Array
 from recon.base import fft
 from recon.camera.depth_mixture import central_psfs
 from recon.camera.refocus_field import at_depth
 from recon.reconstruction.reconstruct import reconstruct
 from recon.types import Calibration
-
-Array = npt.NDArray[Any]
-Floats = npt.NDArray[np.float64]
 
 PICTURES, PAIRS = 5, 24
 """Pictures that are reconstructed, and pairs in each, half of them along each axis.
@@ -59,7 +55,7 @@ _FARTHEST = 3.0
 class _Pair:
     px: float
     axis: int
-    first: Floats
+    first: Float64Array
     """``(row, column)`` of the first point, pixels from the middle ``n // 2``; the second one is ``px``
     farther along the axis."""
 
@@ -69,9 +65,9 @@ class _Pair:
         return float(self.first[self.axis] % 1)
 
     @property
-    def points(self) -> Floats:
+    def points(self) -> Float64Array:
         """(2, 2): both places."""
-        along: Floats = self.px * np.eye(2)[self.axis]
+        along: Float64Array = self.px * np.eye(2)[self.axis]
         return np.stack([self.first, self.first + along])
 
     def told_apart(self, picture: Array) -> bool:
@@ -108,7 +104,7 @@ class _Tests:
             for n, (px, cell) in enumerate(zip(distances, places, strict=False))
         ]
 
-    def told_apart(self, pairs: Sequence[_Pair], light: Floats) -> list[bool]:
+    def told_apart(self, pairs: Sequence[_Pair], light: Float64Array) -> list[bool]:
         """Photograph and reconstruct pairs that make this light, with the noise of one of them."""
         scale = self.noise.electrons * len(pairs) / float(light.sum()) * self._peak(pairs[0])
         mean = scale * np.maximum(light, 0.0) / len(pairs)
@@ -253,7 +249,7 @@ def _focus_um(
     return 1 / near, (1 / far if far > 0 else float("inf"))
 
 
-def cells(psf: Array, px: float, least_px: float = _CELL_PX) -> Floats:
+def cells(psf: Array, px: float, least_px: float = _CELL_PX) -> Float64Array:
     """Return the middles of the cells that pairs stand in, (n, 2): where all of the pattern is seen.
 
     At least within :data:`_CERTAIN` of the sensor, where its pattern leaves no rim.
@@ -267,7 +263,7 @@ def cells(psf: Array, px: float, least_px: float = _CELL_PX) -> Floats:
     return np.array(list(product(*sides)))
 
 
-def shifted(psf: Array, points: Floats) -> Floats:
+def shifted(psf: Array, points: Float64Array) -> Float64Array:
     """Return the sum of a PSF (height, width) shifted to points (n, 2) between pixels, by linear phases."""
     room = 2 * int(np.ceil(np.abs(points).max()) + 2)
     shape = fft.fast_shape([n + room for n in psf.shape])

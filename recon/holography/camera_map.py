@@ -9,17 +9,15 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from math import ceil
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
+from recon.arrays import Array, Float32Array, Float64Array
 from recon.base.fft import fast_length
 from recon.errors import InputError
 from recon.holography.display import Display
 from recon.holography.target import Band
-
-Array = npt.NDArray[Any]
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,7 +38,7 @@ class CameraMap:
 
     shape: tuple[int, int]
     pixels_across: float
-    coefficients: npt.NDArray[np.float64]
+    coefficients: Float64Array
     residual_px: float = float("nan")
 
     def turned(self, rad: float) -> CameraMap:
@@ -61,7 +59,7 @@ class CameraMap:
         """How large the field is around its middle, over what it is nominally."""
         return float(np.sqrt(abs(np.linalg.det(self.gradient(0.0, 0.0)))) / self.pixels_across)
 
-    def gradient(self, y: float, x: float) -> npt.NDArray[np.float64]:
+    def gradient(self, y: float, x: float) -> Float64Array:
         """Return by how many (rows, columns) a place moves with y (first column) and x around it."""
         step = 0.01
         here = self.pixels(np.array(y), np.array(x))
@@ -120,7 +118,7 @@ def polynomial_map(nominal: CameraMap, places: Array, shifts: Array) -> CameraMa
     return CameraMap(nominal.shape, nominal.pixels_across, nominal.coefficients + solution, residual)
 
 
-def mask_speckle(display: Display) -> npt.NDArray[np.float32]:
+def mask_speckle(display: Display) -> Float32Array:
     """Return the far field of the mask alone over the field of view, at twice the mask's own sampling."""
     import scipy.fft
 

@@ -8,6 +8,7 @@ from math import asin, atan, ceil, degrees, pi, radians, sin, sqrt, tan
 import numpy as np
 import numpy.typing as npt
 
+from recon.arrays import Float64Array
 from recon.base.fft import fast_length
 from recon.errors import InputError
 from recon.holography.learned import Learned
@@ -28,7 +29,7 @@ class ScatteringMask:
     """
 
     levels: npt.NDArray[np.uint8]
-    phases_rad: npt.NDArray[np.float64]
+    phases_rad: Float64Array
     design_wavelength_nm: float = 660.0
 
     def __post_init__(self) -> None:
@@ -138,7 +139,7 @@ class Display:
     focal_mm: float = 75.0
     dc: DcTerm = DcTerm(0.0)
     mask_fill: float = 0.0
-    displacement: npt.NDArray[np.float64] | None = None
+    displacement: Float64Array | None = None
     learned: Learned | None = None
     distance_mm: float | None = None
     lost_db: float | None = None
@@ -267,7 +268,7 @@ class Display:
         away_mm = self.focal_mm if self.distance_mm is None else self.distance_mm
         return self.wavelength_nm * 1e-3 * away_mm / self.mask_pitch_um
 
-    def envelope(self, shape: tuple[int, int]) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
+    def envelope(self, shape: tuple[int, int]) -> tuple[Float64Array, Float64Array]:
         """Return the mask pixels' intensity envelope over the field, in FFT order, as two factors.
 
         All even where a picture is :attr:`near`: there it is part of the propagation.
@@ -302,7 +303,7 @@ class Display:
         dc = DcTerm(min(abs(light) ** 2 / whole, 0.9), float(np.angle(light)))
         return replace(self, learned=learned, dc=dc)
 
-    def transmitted(self, shape: tuple[int, int]) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
+    def transmitted(self, shape: tuple[int, int]) -> tuple[Float64Array, Float64Array]:
         """Return the envelope with the vignetting that was learned, as :meth:`envelope`."""
         y, x = self.envelope(shape)
         if self.learned is None:

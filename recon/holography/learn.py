@@ -15,8 +15,8 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
+from recon.arrays import Array
 from recon.errors import InputError
 from recon.holography.display import Display
 from recon.holography.learned import Learned, terms
@@ -24,8 +24,6 @@ from recon.holography.model import HologramModel
 from recon.holography.panel import Panel
 from recon.holography.pose import NODES
 from recon.holography.target import ORDER, Target
-
-Array = npt.NDArray[Any]
 
 CUTS = (0.25, 0.5, 1.0, 1.0, 1.0)
 """Of the eye's cut-off, up to which lags count, round by round."""

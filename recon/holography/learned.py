@@ -12,15 +12,13 @@ In the symbols of :mod:`recon.holography.model`, with ``phi`` the phase that a p
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 from numpy.polynomial.legendre import legvander
 
+from recon.arrays import Array, Float64Array
 from recon.errors import InputError
-
-Array = npt.NDArray[Any]
 
 _SHADE_ORDERS = (1, 2, 3, 4)
 
@@ -46,12 +44,12 @@ class Learned:
         Phase of the mask's steps over what they should be.
     """
 
-    response: npt.NDArray[np.float64]
-    dc: npt.NDArray[np.float64]
-    crosstalk_px: npt.NDArray[np.float64]
-    amplitude: npt.NDArray[np.float64]
-    phase: npt.NDArray[np.float64]
-    shade: npt.NDArray[np.float64]
+    response: Float64Array
+    dc: Float64Array
+    crosstalk_px: Float64Array
+    amplitude: Float64Array
+    phase: Float64Array
+    shade: Float64Array
     mask_depth: float
 
     def __post_init__(self) -> None:
@@ -130,7 +128,7 @@ def order_of(count: int) -> int:
     raise InputError(f"{count} coefficients are those of no order of polynomials.")
 
 
-def legendre(order: int, n: int) -> npt.NDArray[np.float64]:
+def legendre(order: int, n: int) -> Float64Array:
     """Return a Legendre polynomial over ``n`` pixels, rms about 1."""
     from scipy.special import eval_legendre
 

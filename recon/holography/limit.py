@@ -18,27 +18,18 @@ import threading
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
+from recon.arrays import Array, Float64Array
 from recon.errors import InputError
 from recon.holography.display import Display, greatest_defocus_mm
 from recon.holography.model import HologramModel
-from recon.holography.optimise import (
-    Hologram,
-    HologramRecord,
-    HologramStop,
-    _Lbfgs,
-    _Watch,
-    compute_hologram,
-)
+from recon.holography.optimise import Hologram, HologramRecord, HologramStop, _Lbfgs, _Watch, compute_hologram
 from recon.holography.options import HologramOptions
 from recon.holography.target import ORDER, Target
 from recon.holography.variables import Point
-
-Array = npt.NDArray[Any]
 
 COLUMNS = 6
 """Of V: more do not lower the loss by a hundredth of a decibel at 16x."""
@@ -77,8 +68,8 @@ class Limit:
 
     bound_db: float
     reached_db: float
-    wanted: npt.NDArray[np.float64]
-    reached: npt.NDArray[np.float64]
+    wanted: Float64Array
+    reached: Float64Array
     stop_reason: HologramStop
     seconds: float
     columns: npt.NDArray[np.complex64]

@@ -9,14 +9,12 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Iterable
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import numpy as np
-import numpy.typing as npt
 
+from recon.arrays import Array
 from recon.base.registry import Registry
-
-Image = npt.NDArray[Any]
 
 
 class Loss(ABC):
@@ -54,7 +52,7 @@ class Loss(ABC):
         return f"{self.name} loss"
 
     @abstractmethod
-    def value(self, difference: Image, wanted: Image | None, weights: Image | None) -> float:
+    def value(self, difference: Array, wanted: Array | None, weights: Array | None) -> float:
         """Return the loss.
 
         Parameters
@@ -65,10 +63,10 @@ class Loss(ABC):
         """
 
     @abstractmethod
-    def gradient(self, difference: Image, wanted: Image | None, weights: Image | None) -> Image:
+    def gradient(self, difference: Array, wanted: Array | None, weights: Array | None) -> Array:
         """Return the derivative of the value by each pixel of the seen image, (height, width)."""
 
-    def evaluate(self, difference: Image, wanted: Image | None, weights: Image | None) -> tuple[float, Image]:
+    def evaluate(self, difference: Array, wanted: Array | None, weights: Array | None) -> tuple[float, Array]:
         """Return value and gradient; ``difference`` may be written over."""
         value = self.value(difference, wanted, weights)
         return value, self.gradient(difference, wanted, weights)
@@ -77,11 +75,11 @@ class Loss(ABC):
 class _MeanSquare(Loss):
     mean_square = True
 
-    def value(self, difference: Image, wanted: Image | None, weights: Image | None) -> float:
+    def value(self, difference: Array, wanted: Array | None, weights: Array | None) -> float:
         """Return half the mean square."""
         return float(np.mean(difference.astype(np.float64) ** 2)) / 2
 
-    def gradient(self, difference: Image, wanted: Image | None, weights: Image | None) -> Image:
+    def gradient(self, difference: Array, wanted: Array | None, weights: Array | None) -> Array:
         """Return ``difference / N``."""
         return difference / difference.size
 
@@ -116,17 +114,17 @@ class Weighted(Loss):
     takes_weights = True
     cost = 1.4
 
-    def value(self, difference: Image, wanted: Image | None, weights: Image | None) -> float:
+    def value(self, difference: Array, wanted: Array | None, weights: Array | None) -> float:
         """Return half the mean square of the weighted difference."""
         assert weights is not None
         return float(np.mean((weights * difference.astype(np.float64)) ** 2)) / 2
 
-    def gradient(self, difference: Image, wanted: Image | None, weights: Image | None) -> Image:
+    def gradient(self, difference: Array, wanted: Array | None, weights: Array | None) -> Array:
         """Return ``weights^2 difference / N``."""
         assert weights is not None
         return weights**2 * difference / difference.size
 
-    def evaluate(self, difference: Image, wanted: Image | None, weights: Image | None) -> tuple[float, Image]:
+    def evaluate(self, difference: Array, wanted: Array | None, weights: Array | None) -> tuple[float, Array]:
         """Return value and gradient, the latter in place of ``difference``."""
         from recon.holography import _kernels
 

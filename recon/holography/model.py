@@ -22,6 +22,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from recon.arrays import Array
 from recon.base.declare import with_overrides
 from recon.base.fft import irfft, rfft
 from recon.base.namespace import array_namespace
@@ -34,8 +35,6 @@ from recon.holography.on_device import OnDevice, Tables
 from recon.holography.options import HologramOptions
 from recon.holography.panel import Panel
 from recon.holography.target import BESIDE, Target, Window, band_of, weights_on
-
-ComplexArray = npt.NDArray[Any]
 
 _ELSEWHERE = 0.3
 """Weight of darkness beside a picture whose amplitude mirrors code: what is there is noise when coded."""
@@ -58,7 +57,7 @@ class Evaluation:
     """
 
     loss: float
-    gradient: ComplexArray
+    gradient: Array
     seen_psnr_db: float
 
 
@@ -120,8 +119,8 @@ class HologramModel:
         self._wanted = [spectrum for spectrum, _ in spectra]
         self.peaks = tuple(peak for _, peak in spectra)
         self._cutoff = 0.0 if unfiltered else self.band.cutoff
-        self._weights: npt.NDArray[Any] | None = None
-        self._wanted_images: list[npt.NDArray[Any] | None] = [None] * len(self.targets)
+        self._weights: Array | None = None
+        self._wanted_images: list[Array | None] = [None] * len(self.targets)
         if not self.loss.mean_square:
             height, width = self.band.seen_shape
             if (weights := options.field_weights()) is not None:
@@ -146,7 +145,7 @@ class HologramModel:
         self._defocus = [
             flat if display.near else tuple(h.astype(self.dtype) for h in display.defocus(z)) for z in depths
         ]
-        self._nodes: npt.NDArray[Any] | None = None
+        self._nodes: Array | None = None
         self._mean_light = 1.0
         self.xp = array_namespace(options.device)
         self.take(display)
@@ -158,7 +157,7 @@ class HologramModel:
         """Whether what is shown jumps where a phase does."""
         return self._panel is not None
 
-    def hold(self, slm: ComplexArray | None, *, within: bool = False) -> None:
+    def hold(self, slm: Array | None, *, within: bool = False) -> None:
         """Let phases run on beyond a turn from those of these patterns, in all that follows; None: wrap.
 
         ``within``: they stop at its ends; :meth:`stopped` are the patterns that are shown then.
@@ -166,7 +165,7 @@ class HologramModel:
         if self._panel is not None:
             self._panel.hold(slm, within=within)
 
-    def stopped(self, slm: ComplexArray) -> ComplexArray:
+    def stopped(self, slm: Array) -> Array:
         """Return the patterns that are shown of these while phases stop at the ends of a turn."""
         return slm if self._panel is None else self._panel.stopped(slm)
 
@@ -227,7 +226,7 @@ class HologramModel:
             arrays += [self._small, self._seen, *(a for a in optional if a is not None)]
         return sum(a.nbytes for a in arrays) + (0 if self._near is None else self._near.nbytes)
 
-    def evaluate(self, slm: ComplexArray) -> Evaluation:
+    def evaluate(self, slm: Array) -> Evaluation:
         """Return loss, gradient and PSNR for SLM patterns, complex (n_frames, height, width)."""
         if self._there is not None:
             loss, gradient, error = self._there.evaluate(slm)
@@ -251,16 +250,16 @@ class HologramModel:
         error = float(np.mean(errors))
         return Evaluation(loss, gradient, -10 * np.log10(error) if error > 0 else np.inf)
 
-    def seen(self, slm: ComplexArray, plane: int = 0) -> npt.NDArray[Any]:
+    def seen(self, slm: Array, plane: int = 0) -> Array:
         """Return the low-passed image, real, on the band's ``seen_shape``, the axis in the middle."""
         self._intensity_spectrum(self._check(slm), plane)
         return self._image(self._spectrum)
 
-    def wanted(self, plane: int = 0) -> npt.NDArray[Any]:
+    def wanted(self, plane: int = 0) -> Array:
         """Return the low-passed target on the grid and in the units of :meth:`seen`."""
         return self._image(self._wanted[plane])
 
-    def intensity(self, slm: ComplexArray, plane: int = 0) -> npt.NDArray[Any]:
+    def intensity(self, slm: Array, plane: int = 0) -> Array:
         """Return the intensity before any low-pass on the band's ``shape``, the centre in the middle."""
         self._intensity_spectrum(self._check(slm), plane)
         total = np.zeros(self.band.shape, self._real)
@@ -269,29 +268,29 @@ class HologramModel:
         total *= self._ey[:, None] * self._ex
         return np.fft.fftshift(total)
 
-    def lags(self, slm: ComplexArray | None = None, plane: int = 0) -> ComplexArray:
+    def lags(self, slm: Array | None = None, plane: int = 0) -> Array:
         """Return Fourier coefficients at the kept lags, (rows, columns), of what is seen, or wanted."""
         if slm is None:
             return self._wanted[plane]
         return self.lags_of_field(self._check(slm), plane)
 
-    def lags_of_field(self, fields: ComplexArray, plane: int = 0) -> ComplexArray:
+    def lags_of_field(self, fields: Array, plane: int = 0) -> Array:
         """Return :meth:`lags` of fields as they leave the SLM, all light included."""
         self._intensity_spectrum(fields, plane)
         rows, top = self.band.kept[0], self.band.top
         return np.concatenate([self._spectrum[:top], self._spectrum[len(self._spectrum) - rows + top :]])
 
-    def efficiency(self, slm: ComplexArray) -> float:
+    def efficiency(self, slm: Array) -> float:
         """Return the part of the light on the SLM that reaches the field, DC term and envelope included."""
         self._intensity_spectrum(self._check(slm), 0)
         passed = 1.0 if self._near is None else self._near.passed
         return float(self._spectrum[0, 0].real) * self._mean_light * passed
 
-    def slope(self) -> ComplexArray:
+    def slope(self) -> Array:
         """Return the row spectra of ``dL/dI`` of the pattern that was evaluated last, for :meth:`weighed`."""
         return self._spectrum.copy()
 
-    def weighed(self, field: ComplexArray, slope: ComplexArray) -> ComplexArray:
+    def weighed(self, field: Array, slope: Array) -> Array:
         """Take a field at the SLM, DC light included, to the first image plane, weigh it there, and back.
 
         ``slope``, from :meth:`slope`, is the weight: the result is the gradient by the field, (height,
@@ -303,7 +302,7 @@ class HologramModel:
         self._backward(0, 0, out)
         return out
 
-    def back_propagate(self, amplitude: ComplexArray, plane: int = 0) -> ComplexArray:
+    def back_propagate(self, amplitude: Array, plane: int = 0) -> Array:
         """Return ``U^H m^* h^* F^-1 amplitude``: a field in the image plane integrated over the SLM pixels.
 
         ``amplitude`` is complex on the band's ``shape`` in FFT order (Kuo 2020, Eqs. 7.11 and 7.12, without
@@ -334,7 +333,7 @@ class HologramModel:
         return window
 
     # Steps -------------------------------------------------------------------------------------
-    def _spectrum_of(self, target: Target) -> tuple[ComplexArray, float]:
+    def _spectrum_of(self, target: Target) -> tuple[Array, float]:
         spectrum, peak = target.spectrum(self.display, self.band)
         share = self.options.share
         if self.display.near:  # the light beside its square goes nowhere else
@@ -362,7 +361,7 @@ class HologramModel:
             raise InputError("The mask is displaced so far that it sees nothing of the SLM.")
         return float(sent * ((1 - display.dc.power) * mixed + display.dc.power * covered))
 
-    def _check(self, slm: ComplexArray) -> ComplexArray:
+    def _check(self, slm: Array) -> Array:
         expected = (self.frames, *self.display.slm_shape)
         if slm.shape != expected:
             raise InputError(f"SLM patterns must be {expected}, not {slm.shape}.")
@@ -373,7 +372,7 @@ class HologramModel:
             return np.ascontiguousarray(slm, self.dtype)
         return np.ascontiguousarray(slm * dc.modulated + dc.amplitude, self.dtype)
 
-    def _intensity_spectrum(self, patterns: ComplexArray, plane: int) -> None:
+    def _intensity_spectrum(self, patterns: Array, plane: int) -> None:
         """Fill ``_field`` with the image plane's fields and ``_spectrum`` with the intensity's kept lags."""
         mask, k = self.display.mask.levels, self._factor
         height, width = mask.shape
@@ -440,11 +439,11 @@ class HologramModel:
         self._kernels.low_pass(spectrum, band.kept[0], self._cutoff, band.top)
         return loss, error
 
-    def _image(self, spectrum: ComplexArray) -> npt.NDArray[Any]:
+    def _image(self, spectrum: Array) -> Array:
         """Return the low-passed image of a half spectrum, the field's centre in the middle."""
         return np.fft.fftshift(self._image_of(spectrum, self.band.cutoff))
 
-    def _image_of(self, spectrum: ComplexArray, cutoff: float) -> npt.NDArray[Any]:
+    def _image_of(self, spectrum: Array, cutoff: float) -> Array:
         """Return the image of a half spectrum in FFT order, low-passed where the cut-off is above 0."""
         height, width = self.band.seen_shape
         small = np.empty((height, width // 2 + 1), self.dtype)
@@ -454,7 +453,7 @@ class HologramModel:
         image *= self._real.type(height * width)
         return image
 
-    def _backward(self, frame: int, plane: int, out: ComplexArray) -> None:
+    def _backward(self, frame: int, plane: int, out: Array) -> None:
         field = self._field[frame]
         scale = 1.0 / np.prod(self.band.shape)
 
@@ -467,7 +466,7 @@ class HologramModel:
         in_blocks(rows, self.band.shape[0], grain=64)
         self._columns_and_gather(frame, plane, out)
 
-    def _columns_and_gather(self, frame: int, plane: int, out: ComplexArray) -> None:
+    def _columns_and_gather(self, frame: int, plane: int, out: Array) -> None:
         mask, k, nodes = self.display.mask.levels, self._factor, self._nodes
         height = mask.shape[0]
         hy, hx = self._defocus[plane]
@@ -500,9 +499,7 @@ class HologramModel:
             out[first:last] += part
 
 
-def _rows_seen(
-    nodes: npt.NDArray[Any], start: int, stop: int, height: int, k: int, slm_rows: int
-) -> tuple[int, int]:
+def _rows_seen(nodes: Array, start: int, stop: int, height: int, k: int, slm_rows: int) -> tuple[int, int]:
     """Return the SLM rows that mask rows ``start`` to ``stop`` may see through a displacement."""
     per_node = (nodes.shape[0] - 1) / height
     around = nodes[int(start * per_node) : int(np.ceil(stop * per_node)) + 1, :, 0]

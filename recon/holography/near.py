@@ -14,10 +14,9 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from recon.arrays import Array
 from recon.base.threads import get_threads, in_blocks
 from recon.holography.display import Display
-
-Array = npt.NDArray[Any]
 
 
 class NearField:

@@ -9,13 +9,13 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
+from recon.arrays import Array
 from recon.base.namespace import Namespace
 from recon.holography.losses import Loss
 from recon.holography.target import Band
 
-Array = Any
+DeviceArray = Any
 """Of the device."""
 
 
@@ -49,13 +49,13 @@ class Tables:
     band: Band
     loss: Loss
     cutoff: float
-    behind: list[npt.NDArray[Any]]
-    envelope: npt.NDArray[Any]
-    wanted: list[npt.NDArray[Any]]
-    images: list[npt.NDArray[Any] | None]
+    behind: list[Array]
+    envelope: Array
+    wanted: list[Array]
+    images: list[Array | None]
     peaks: tuple[float, ...]
-    weights: npt.NDArray[Any] | None
-    inside: npt.NDArray[Any] | None
+    weights: Array | None
+    inside: Array | None
     factor: int
     modulated: float
     amplitude: complex
@@ -69,7 +69,7 @@ class OnDevice:
         self.xp, self.tables = xp, tables
         self.real = np.empty(0, tables.dtype).real.dtype
 
-        def there(array: npt.NDArray[Any] | None) -> Array:
+        def there(array: Array | None) -> DeviceArray:
             return None if array is None else xp.asarray(array)
 
         self._behind = [there(one) for one in tables.behind]
@@ -89,12 +89,12 @@ class OnDevice:
             twice[-1] = 1.0
         self._twice = xp.asarray(twice)
 
-    def _low_pass(self, y: Array, x: Array, cutoff: float) -> Array:
+    def _low_pass(self, y: DeviceArray, x: DeviceArray, cutoff: float) -> DeviceArray:
         """Kuo 2020, Eq. 7.18, on the kept lags; everything passes where the cut-off is 0."""
         r = (y[:, None] ** 2 + x**2) / cutoff**2 if cutoff else np.zeros((len(y), len(x)))
         return self.xp.asarray((1 / (1 + r**5)).astype(self.real))
 
-    def evaluate(self, slm: Array) -> tuple[float, Array, float]:
+    def evaluate(self, slm: DeviceArray) -> tuple[float, DeviceArray, float]:
         """Return loss, gradient by the SLM's field, (n_frames, height, width), and relative square error."""
         xp, model = self.xp, self.tables
         shape = model.band.shape
@@ -121,7 +121,7 @@ class OnDevice:
         gradient *= self.real.type(model.modulated)
         return loss, gradient, error / len(self._behind)
 
-    def _loss(self, kept: Array, plane: int) -> tuple[float, float, Array]:
+    def _loss(self, kept: DeviceArray, plane: int) -> tuple[float, float, DeviceArray]:
         """Return loss, mean square error, and ``dL/dI``'s kept lags (Kuo 2020, Eq. A.9)."""
         xp, model = self.xp, self.tables
         difference = kept - self._wanted[plane]
@@ -138,18 +138,18 @@ class OnDevice:
         slope = xp.fft.rfft2(model.loss.gradient(seen, self._images[plane], self._weights))
         return value, error, self._kept(slope, seen_shape[0]).astype(model.dtype, copy=False) * self._filter
 
-    def _power(self, lags: Array) -> float:
+    def _power(self, lags: DeviceArray) -> float:
         return float(((lags.real**2 + lags.imag**2).sum(axis=0, dtype=np.float64) * self._twice).sum())
 
-    def _rows(self, height: int) -> Array:
+    def _rows(self, height: int) -> DeviceArray:
         """Return where the kept rows of a spectrum of some height are."""
         kept, top = self.tables.band.kept[0], self.tables.band.top
         return self.xp.asarray(np.concatenate([np.arange(top), np.arange(height - kept + top, height)]))
 
-    def _kept(self, spectrum: Array, height: int) -> Array:
+    def _kept(self, spectrum: DeviceArray, height: int) -> DeviceArray:
         return spectrum[self._rows(height)][:, : self.tables.band.kept[1]]
 
-    def _spread(self, lags: Array, shape: tuple[int, int]) -> Array:
+    def _spread(self, lags: DeviceArray, shape: tuple[int, int]) -> DeviceArray:
         """Put kept lags into a half spectrum of zeros."""
         whole = self.xp.zeros(shape, self.tables.dtype)
         rows = self.xp.zeros((shape[0], lags.shape[1]), self.tables.dtype)

@@ -17,14 +17,13 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from recon.arrays import Array, Float32Array
 from recon.base.declare import with_overrides
 from recon.base.namespace import to_host
 from recon.errors import InputError
 from recon.holography.model import HologramModel
 from recon.holography.options import HologramOptions
 from recon.holography.variables import FIRST_ORDER, Bounded, Mirrors, Phase, Point, Variable, coded, decoded
-
-Array = npt.NDArray[Any]
 
 _OF_THE_MODEL = (
     *("loss", "centre", "radius", "periphery", "weights", "grid"),
@@ -75,7 +74,7 @@ class Hologram:
     seconds: float
 
     @property
-    def phase_rad(self) -> npt.NDArray[np.float32]:
+    def phase_rad(self) -> Float32Array:
         """Phase in 0 to 2 pi, float32 (n_frames, height, width)."""
         return np.mod(np.angle(self.slm), 2 * np.pi).astype(np.float32)
 

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any, Literal, get_args
+from typing import Literal, get_args
 
 import numpy as np
-import numpy.typing as npt
 
+from recon.arrays import Array
 from recon.base.declare import option, require
 from recon.base.namespace import DEVICES, Device
 from recon.errors import InputError
@@ -102,7 +102,7 @@ class HologramOptions:
         group=_COUNTS,
         applies=_OF_PICTURES,
     )
-    weights: npt.NDArray[Any] | None = option(
+    weights: Array | None = option(
         None,
         help="Weights over the whole field, (height, width), any size, not negative, instead of the fovea.",
         flags=("",),
@@ -285,7 +285,7 @@ class HologramOptions:
             return self.light
         return LIGHT if self.complex_slm else LIGHT_MIRRORED
 
-    def field_weights(self) -> npt.NDArray[Any] | None:
+    def field_weights(self) -> Array | None:
         """Return the weights over the field, (height, width); None where the loss takes none."""
         if not loss_of(self.loss).takes_weights:
             return None

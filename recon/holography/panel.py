@@ -6,14 +6,12 @@ Symbols as in :mod:`recon.holography.learned`.
 from __future__ import annotations
 
 from math import ceil, pi
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
+from recon.arrays import Array, Float64Array
 from recon.holography.display import Display
-
-Array = npt.NDArray[Any]
 
 LEAST_CROSSTALK = 0.03
 """SLM pixels: less moves no light that a hologram feels, and would be computed for every mask pixel."""
@@ -136,7 +134,7 @@ def _near(pattern: Array, anchor: Array) -> Array:
     return np.asarray(anchor + np.angle(pattern * np.exp(-1j * anchor)))
 
 
-def _shares(sigma: float, parts: int) -> npt.NDArray[np.float64]:
+def _shares(sigma: float, parts: int) -> Float64Array:
     """Return what samples of a pixel have of its neighbours and, in the middle, of itself, (2 n + 1, parts).
 
     A phase that is constant over pixels, smoothed by a Gaussian of ``sigma`` pixels; of each sample the sum

@@ -11,11 +11,10 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
+from recon.arrays import Array, Float64Array
 from recon.errors import InputError
 from recon.holography.display import Display
 from recon.holography.learn import Look
@@ -24,8 +23,6 @@ from recon.holography.pose import Pose, nodes_of, on_mask, propagated
 from recon.holography.sections import ORDER, POWERS, SmoothField, likelihood, split_field
 from recon.holography.target import ORDER as STEEPNESS
 from recon.holography.target import band_of
-
-Array = npt.NDArray[Any]
 
 NEAR_STEPS, MOST_STEPS = 5, 8
 AT_FIRST = 2
@@ -67,7 +64,7 @@ class FittedPlace:
 
     pose: Pose
     field: SmoothField
-    deep_error: npt.NDArray[np.float64]
+    deep_error: Float64Array
     dc: complex
     before: float
     after: float
@@ -77,7 +74,7 @@ def fit_place(
     display: Display,
     looks: Sequence[Look],
     pose: Pose,
-    rest: npt.NDArray[np.float64],
+    rest: Float64Array,
     *,
     tilt_mrad: float = 5.0,
 ) -> FittedPlace:
@@ -169,7 +166,7 @@ def _misfit(systems: Sequence[_System], covariance: Array, noise: float) -> floa
 class _Fit:
     """What photographs show of a mask's place, and how that changes with it."""
 
-    def __init__(self, display: Display, pose: Pose, rest: npt.NDArray[np.float64]) -> None:
+    def __init__(self, display: Display, pose: Pose, rest: Float64Array) -> None:
         self.display, self.pose = display, pose
         self.displacement = pose.displacement(display.mask.shape) + rest
         self.band = band_of(display, "alias-free")
@@ -202,7 +199,7 @@ class _Fit:
         self.weights = weights[self.used].astype(np.float32)
         self.count = float((weights**2).sum())
 
-    def bent(self, coefficients: Array) -> npt.NDArray[np.float64]:
+    def bent(self, coefficients: Array) -> Float64Array:
         """Return the displacement of coefficients along rows, then columns, on the nodes."""
         rows = coefficients[:_BENDS].reshape(2, -1)
         return np.stack([np.tensordot(row, self.bends, 1) for row in rows], axis=-1)
@@ -241,7 +238,7 @@ class _Fit:
         left = left - free @ (free.T @ left)
         return _System(jacobian @ jacobian.T, jacobian @ left, float(left @ left))
 
-    def _parts(self, vector: Array, slm: Array) -> tuple[Array, npt.NDArray[np.float64], Array]:
+    def _parts(self, vector: Array, slm: Array) -> tuple[Array, Float64Array, Array]:
         """Return the light at the SLM, the displacement, and what is uneven in light and wavefront."""
         pattern = (slm + complex(*vector[_BENDS + _DEEP :][:_DC])).astype(np.complex64)
         light = vector[_BENDS + _DEEP + _DC :]
@@ -251,7 +248,7 @@ class _Fit:
         whole = np.exp(self.down.T @ uneven.astype(np.complex64) @ self.across)
         return pattern, self.displacement + self.bent(vector), np.asarray(whole, np.complex64)
 
-    def _shown(self, vector: Array, pattern: Array, nodes: npt.NDArray[np.float64], uneven: Array) -> Array:
+    def _shown(self, vector: Array, pattern: Array, nodes: Float64Array, uneven: Array) -> Array:
         """Return the lags of what a pattern shows, from halves of the mask's pixels."""
         import scipy.fft
 
@@ -264,7 +261,7 @@ class _Fit:
         return self._lags_of(field.real**2 + field.imag**2, self.fine_envelope)
 
     def _slopes(
-        self, vector: Array, pattern: Array, nodes: npt.NDArray[np.float64], uneven: Array
+        self, vector: Array, pattern: Array, nodes: Float64Array, uneven: Array
     ) -> tuple[Array, Iterator[Array]]:
         """Return the far field of a pattern, and how it changes with each unknown."""
         import scipy.fft

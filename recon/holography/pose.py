@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import astuple, dataclass, fields, replace
-from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
+from recon.arrays import Array, Float64Array
 from recon.base.metrics import psnr
 from recon.holography.display import Display
 from recon.holography.model import HologramModel
@@ -47,11 +46,11 @@ class Pose:
     pitch_mrad: float = 0.0
     yaw_mrad: float = 0.0
 
-    def vector(self) -> npt.NDArray[np.float64]:
+    def vector(self) -> Float64Array:
         """Return the parameters as a vector, in the order of :data:`NAMES`."""
         return np.array(astuple(self))
 
-    def plus(self, change: npt.NDArray[np.float64]) -> Pose:
+    def plus(self, change: Float64Array) -> Pose:
         """Return the pose with a vector of changes added."""
         return Pose(*(float(v) for v in self.vector() + change))
 
@@ -59,7 +58,7 @@ class Pose:
         """Return the pose with some parameters replaced."""
         return replace(self, **values)
 
-    def displacement(self, mask_shape: tuple[int, int]) -> npt.NDArray[np.float64]:
+    def displacement(self, mask_shape: tuple[int, int]) -> Float64Array:
         """Return the displacement field for :class:`recon.holography.Display`.
 
         It is (*NODES, 2), in mask pixels.
@@ -81,7 +80,7 @@ NODES = (13, 23)
 
 def nodes_of(
     mask_shape: tuple[int, int], count: tuple[int, int] = NODES
-) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
+) -> tuple[Float64Array, Float64Array]:
     """Return y and x of the nodes of displacement fields, mask pixels from the centre."""
     y, x = ((np.linspace(0, 1, n) - 0.5) * size for n, size in zip(count, mask_shape, strict=True))
     grid_y, grid_x = np.meshgrid(y, x, indexing="ij")
@@ -91,9 +90,7 @@ def nodes_of(
 NAMES = tuple(field.name for field in fields(Pose))
 
 
-def natural_steps(
-    mask_shape: tuple[int, int], factor: int, pitch_um: float, depth_um: float
-) -> npt.NDArray[np.float64]:
+def natural_steps(mask_shape: tuple[int, int], factor: int, pitch_um: float, depth_um: float) -> Float64Array:
     """Return changes of each parameter that cost a spot a third to a half of its light.
 
     Parameters
@@ -110,9 +107,6 @@ def natural_steps(
     move, edge, depth = 0.4 * factor, 0.7 * factor, 0.7 * depth_um
     tilts = [1e3 * depth / (half * pitch_um) for half in (half_y, half_x)]
     return np.array([move, move, 1e3 * edge / half_x, edge / half_x, 4.0 * factor, depth, *tilts])
-
-
-Array = npt.NDArray[Any]
 
 
 class PlacedHologram:
@@ -139,7 +133,7 @@ class PlacedHologram:
         display: Display,
         target: Target,
         pose: Pose,
-        rest: npt.NDArray[np.float64] | None = None,
+        rest: Float64Array | None = None,
         *,
         iterations: int = 30,
     ) -> None:
@@ -154,7 +148,7 @@ class PlacedHologram:
         self._wanted = np.fft.ifftshift(np.asarray(model.wanted(), float))
         self._peak = model.peaks[0]
 
-    def psnr_db(self, pose: Pose, error: npt.NDArray[np.float64] | None = None) -> float:
+    def psnr_db(self, pose: Pose, error: Float64Array | None = None) -> float:
         """Return the PSNR seen where the mask is at ``pose``.
 
         Parameters

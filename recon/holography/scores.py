@@ -8,11 +8,10 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
+from recon.arrays import Array
 from recon.base.metrics import psnr, ssim
 from recon.errors import InputError
 from recon.holography.display import Display, random_mask
@@ -20,8 +19,6 @@ from recon.holography.model import HologramModel
 from recon.holography.optimise import compute_hologram
 from recon.holography.options import HologramOptions
 from recon.holography.target import Grid, Target, foveal_weights, weights_on
-
-Array = npt.NDArray[Any]
 
 
 @dataclass(frozen=True, slots=True)
@@ -125,7 +122,6 @@ def compare(seen: Array, wanted: Array, peak: float, weights: Array | None = Non
 _FULLY = 0.99
 """Of the greatest weight."""
 
-Image = npt.NDArray[Any]
 
 METHODS = ("one-step", "none", "frequency", "spatial")
 GRIDS: tuple[Grid, Grid] = ("dissertation", "alias-free")
@@ -160,13 +156,13 @@ class Cell:
     seconds: float
 
 
-def table_weights() -> Image:
+def table_weights() -> Array:
     """Return the foveated weights of the table: 1 over the middle quarter, 0.1 in the periphery."""
     return foveal_weights((256, 256), radius=0.3, periphery=0.1, edge=0.1)
 
 
 def run_cell(
-    display: Display, image: Image, method: str, grid: Grid, *, picture: str = "", iterations: int = 100
+    display: Display, image: Array, method: str, grid: Grid, *, picture: str = "", iterations: int = 100
 ) -> Cell:
     """Compute and judge one hologram; ``image`` is on the mask's grid."""
     one_step = method == "one-step"
@@ -186,7 +182,7 @@ def run_cell(
 
 
 def run_table(
-    pictures: Mapping[str, Callable[[tuple[int, int]], Image]],
+    pictures: Mapping[str, Callable[[tuple[int, int]], Array]],
     slm_shape: tuple[int, int],
     *,
     expansions: Sequence[int] = (4, 16, 36),

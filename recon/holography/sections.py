@@ -9,16 +9,13 @@ rest.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
+from recon.arrays import Array, Float64Array
 from recon.errors import InputError
 from recon.holography.pose import NODES, Pose, nodes_of
 from recon.holography.spots import Spot, SpotMaker
-
-Array = npt.NDArray[Any]
 
 ORDER = 3
 """Of the polynomial: distortion of a lens, centred or not, is third order and what decentring makes of it."""
@@ -52,7 +49,7 @@ class Sections:
             for j in range(self.division[1])
         ]
 
-    def basis(self) -> npt.NDArray[np.float64]:
+    def basis(self) -> Float64Array:
         """Return the mean of every monomial over every section, (sections, monomials)."""
         height, width = self.slm_shape
         y, x = (2 * (np.arange(n) + 0.5) / width - n / width for n in (height, width))
@@ -66,12 +63,12 @@ LIKELY = 1.0
 that is expected before anything is measured: keeps a field tame between and beyond the sections."""
 
 
-def likelihood() -> npt.NDArray[np.float64]:
+def likelihood() -> Float64Array:
     """Return the inverse covariance of the monomials before anything is measured of a mask."""
     return np.diag([0.0 if i + j < 2 else LIKELY**-2 for i, j in POWERS])
 
 
-def hypotheses(step: float) -> npt.NDArray[np.float64]:
+def hypotheses(step: float) -> Float64Array:
     """Return local shifts (y, x) to try in a section: none, and ``step`` mask pixels each way."""
     return step * np.array([[0.0, 0.0], [1.0, 0.0], [-1.0, 0.0], [0.0, 1.0], [0.0, -1.0]])
 
@@ -101,9 +98,9 @@ class SectionShifts:
         Of a spot at the right shift, in the units of the measurement; 0 where nothing was found.
     """
 
-    shift: npt.NDArray[np.float64]
-    error: npt.NDArray[np.float64]
-    amplitude: npt.NDArray[np.float64]
+    shift: Float64Array
+    error: Float64Array
+    amplitude: Float64Array
 
 
 def fit_shifts(
@@ -180,10 +177,10 @@ class SmoothField:
         Rms of the sections' shifts about the field over their uncertainties; about 1 where it is smooth.
     """
 
-    change: npt.NDArray[np.float64]
-    rest: npt.NDArray[np.float64]
-    modes: npt.NDArray[np.float64]
-    error: npt.NDArray[np.float64]
+    change: Float64Array
+    rest: Float64Array
+    modes: Float64Array
+    error: Float64Array
     misfit: float
 
 
@@ -229,9 +226,7 @@ def fit_field(found: SectionShifts, sections: Sections, mask_shape: tuple[int, i
     return SmoothField(change, rest, unsure, error, misfit)
 
 
-def split_field(
-    field: npt.NDArray[np.float64], mask_shape: tuple[int, int]
-) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
+def split_field(field: Float64Array, mask_shape: tuple[int, int]) -> tuple[Float64Array, Float64Array]:
     """Split a small displacement field into shift, rotation and scale (as a pose's vector) and the rest."""
     y, x = nodes_of(mask_shape, (field.shape[0], field.shape[1]))
     dy, dx = field[..., 0], field[..., 1]

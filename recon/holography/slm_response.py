@@ -2,14 +2,10 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
-import numpy.typing as npt
 
+from recon.arrays import Array, Float64Array
 from recon.errors import InputError
-
-Array = npt.NDArray[Any]
 
 _OF_ELLIPSE = 5  # parameters
 _ROUNDS = 60
@@ -18,7 +14,7 @@ MODES = ((2, 0), (1, 1), (0, 2), (3, 0), (2, 1), (1, 2), (0, 3))
 """Powers of y and x of the flatness modes; constant and linear terms move nothing but the whole picture."""
 
 
-def phases_from_frames(frames: Array) -> tuple[npt.NDArray[np.float64], float]:
+def phases_from_frames(frames: Array) -> tuple[Float64Array, float]:
     """Return the phase steps behind a series of interference pictures.
 
     Part of the SLM's pixels shows level 0, the others one level after the other. Every camera pixel then sees
@@ -71,7 +67,7 @@ def phases_from_frames(frames: Array) -> tuple[npt.NDArray[np.float64], float]:
     return (phases if phases[-1] >= 0 else -phases), error
 
 
-def _with_levels(flat: Array, phases: Array) -> tuple[npt.NDArray[np.float64], float]:
+def _with_levels(flat: Array, phases: Array) -> tuple[Float64Array, float]:
     """Let each picture have a brightness of its own; returns phases and their standard deviation, radians.
 
     ``s_n (a + b cos(phi_n) + c sin(phi_n))`` lies on a cone. Its apex tells every ``s_n`` but for what goes
@@ -96,10 +92,10 @@ def _with_levels(flat: Array, phases: Array) -> tuple[npt.NDArray[np.float64], f
     return phases, float(np.sqrt(noise + 2 * levels.var() / len(points)))
 
 
-def mode(index: int, shape: tuple[int, int]) -> npt.NDArray[np.float64]:
+def mode(index: int, shape: tuple[int, int]) -> Float64Array:
     """Return a flatness mode on a grid over the SLM: orthonormal polynomials, rms 1."""
     basis = _basis(shape)
-    found: npt.NDArray[np.float64] = basis[index]
+    found: Float64Array = basis[index]
     return found
 
 
@@ -113,7 +109,7 @@ def _basis(shape: tuple[int, int]) -> Array:
     return basis
 
 
-def flatness_jacobian(step: float) -> npt.NDArray[np.float64]:
+def flatness_jacobian(step: float) -> Float64Array:
     """Return how ``(a+ - a-) / (a+ + a-)`` of spot pairs answers to an error, per radian, (7, 7).
 
     The pair of mode ``p`` takes off ``+step`` and ``-step`` radians of it; a spot's amplitude is the mean of

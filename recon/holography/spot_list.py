@@ -11,18 +11,16 @@ import threading
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
+from recon.arrays import Array, Float64Array
 from recon.errors import InputError
 from recon.holography.display import Display
 from recon.holography.optimise import Hologram, HologramRecord, HologramStop
 from recon.holography.options import HologramOptions
 from recon.holography.panel import Panel
-
-Array = npt.NDArray[Any]
 
 EVEN = 0.002
 """Deviation of the spots' brightness, relative, at which the search ends."""
@@ -49,9 +47,9 @@ class SpotList:
         Behind the focal plane.
     """
 
-    places: npt.NDArray[np.float64]
-    intensity: npt.NDArray[np.float64]
-    z_mm: npt.NDArray[np.float64]
+    places: Float64Array
+    intensity: Float64Array
+    z_mm: Float64Array
 
     def __post_init__(self) -> None:
         n = len(self.places)
@@ -94,7 +92,7 @@ class SpotScores:
         Part of the light on the SLM that is in all spots together, each a resolution cell of the aperture.
     """
 
-    relative: npt.NDArray[np.float64]
+    relative: Float64Array
     efficiency: float
 
     @property

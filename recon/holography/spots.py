@@ -11,16 +11,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 import scipy.fft
 
+from recon.arrays import Array, Float64Array
 from recon.holography.display import Display
 from recon.holography.pose import NAMES, Pose, natural_steps
-
-Array = npt.NDArray[Any]
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,8 +33,8 @@ class PoseStep:
         Standard uncertainty of the change.
     """
 
-    change: npt.NDArray[np.float64]
-    error: npt.NDArray[np.float64]
+    change: Float64Array
+    error: Float64Array
 
 
 class PoseProbe:
@@ -54,7 +52,7 @@ class PoseProbe:
         self.steps = natural_steps(
             display.mask.shape, display.factor, display.mask_pitch_um, depth_um(display)
         )
-        self._jacobian: npt.NDArray[np.float64] | None = None
+        self._jacobian: Float64Array | None = None
 
     def poses(self, pose: Pose) -> list[Pose]:
         """Return the probe poses: plus and minus for each parameter, then the pose itself."""
@@ -65,7 +63,7 @@ class PoseProbe:
             found += [pose.plus(change), pose.plus(-change)]
         return [*found, pose]
 
-    def jacobian(self) -> npt.NDArray[np.float64]:
+    def jacobian(self) -> Float64Array:
         """Return ``dg_p / d(error_q / step_q)``, (8, 8)."""
         if self._jacobian is None:
             n = len(NAMES)
@@ -184,7 +182,7 @@ class SpotMaker:
         Displacement beyond that of the poses, on the nodes of :meth:`Pose.displacement`, mask pixels.
     """
 
-    rest: npt.NDArray[np.float64] | None = None
+    rest: Float64Array | None = None
 
     def __init__(self, display: Display) -> None:
         self.display = display
@@ -279,7 +277,7 @@ class SpotMaker:
         return SpotPattern(slm, tuple(spots), self.ideal(len(spots)))
 
     # Steps -------------------------------------------------------------------------------------
-    def _at_slm(self, spot: Spot, shift: npt.NDArray[np.float64]) -> npt.NDArray[np.complex64]:
+    def _at_slm(self, spot: Spot, shift: Float64Array) -> npt.NDArray[np.complex64]:
         """Field in the SLM's image plane, two samples per SLM pixel, in the frame of a shifted mask."""
         pose = spot.pose
         height, width = self.display.mask.shape
@@ -319,8 +317,8 @@ class SpotMaker:
 
 
 def _mean_of(
-    nodes: npt.NDArray[np.float64], section: tuple[slice, slice] | None, slm_shape: tuple[int, int]
-) -> npt.NDArray[np.float64]:
+    nodes: Float64Array, section: tuple[slice, slice] | None, slm_shape: tuple[int, int]
+) -> Float64Array:
     """Return the displacement (y, x) in the middle of a section, or of the SLM."""
     parts = section or tuple(slice(0, n) for n in slm_shape)
     place = [
@@ -330,7 +328,7 @@ def _mean_of(
     j, i = (min(int(p), n - 2) for p, n in zip(place, nodes.shape[:2], strict=True))
     v, u = place[0] - j, place[1] - i
     left, right = (nodes[j, n] * (1 - v) + nodes[j + 1, n] * v for n in (i, i + 1))
-    middle: npt.NDArray[np.float64] = left * (1 - u) + right * u
+    middle: Float64Array = left * (1 - u) + right * u
     return middle
 
 

@@ -5,11 +5,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from math import ceil, pi, sqrt
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 import numpy.typing as npt
 
+from recon.arrays import Array, Float64Array
 from recon.base.fft import fast_length
 from recon.errors import InputError
 from recon.holography.display import Display
@@ -69,7 +70,7 @@ class Band:
             return self.shape
         return (fast_length(self.kept[0]), fast_length(2 * self.kept[1] - 1, real=True))
 
-    def lags(self) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
+    def lags(self) -> tuple[Float64Array, Float64Array]:
         """Return the lags of the kept rows (first the positive ones) and columns, mask pixels."""
         rows = self.kept[0]
         y = np.arange(rows, dtype=float)
@@ -184,7 +185,7 @@ class Target:
         Where in the field it counts; everywhere by default.
     """
 
-    image: npt.NDArray[Any]
+    image: Array
     z_mm: float = 0.0
     white: float | None = None
     window: Window | None = None
@@ -195,7 +196,7 @@ class Target:
         if not np.isfinite(self.image).all() or self.image.min() < 0 or self.image.max() <= 0:
             raise InputError("A target must be finite, not negative, and not black everywhere.")
 
-    def scaled(self, display: Display) -> tuple[npt.NDArray[np.float64], float]:
+    def scaled(self, display: Display) -> tuple[Float64Array, float]:
         """Return the image and its peak, scaled to what the display can emit, in FFT order (axis first).
 
         A phase SLM cannot make the whole field darker: the mean of the intensity before the mask's envelope
@@ -225,7 +226,7 @@ class Target:
         return kept, peak
 
 
-def weights_on(weights: npt.NDArray[Any], shape: tuple[int, int]) -> npt.NDArray[np.float64]:
+def weights_on(weights: Array, shape: tuple[int, int]) -> Float64Array:
     """Return weights over the field on another grid over it, in FFT order, greatest value 1."""
     from scipy.ndimage import map_coordinates
 
@@ -235,7 +236,7 @@ def weights_on(weights: npt.NDArray[Any], shape: tuple[int, int]) -> npt.NDArray
     return np.asarray(smooth / weights.max(), np.float64)
 
 
-def _places(n: int) -> npt.NDArray[np.float64]:
+def _places(n: int) -> Float64Array:
     """Return where an image's pixels are in the field, in fractions of it: the middle one is on the axis."""
     return 0.5 + (np.arange(n) - n // 2) / n
 
@@ -247,7 +248,7 @@ def foveal_weights(
     radius: float = 0.28,
     periphery: float = 0.1,
     edge: float = 0.1,
-) -> npt.NDArray[np.float64]:
+) -> Float64Array:
     """Return weights that are 1 around a point and fall smoothly to ``periphery`` (Sec. 7.4).
 
     Parameters
@@ -278,7 +279,7 @@ def painted_weights(
     strokes: Sequence[tuple[float, float, float, float]],
     *,
     background: float = 0.1,
-) -> npt.NDArray[np.float64]:
+) -> Float64Array:
     """Return weights painted with a round brush: later strokes cover earlier ones.
 
     Parameters

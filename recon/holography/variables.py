@@ -6,11 +6,9 @@ from dataclasses import replace
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
-import numpy.typing as npt
 
+from recon.arrays import Array, BoolArray
 from recon.holography.model import Evaluation, HologramModel
-
-Array = npt.NDArray[Any]
 
 
 class Point(NamedTuple):
@@ -56,7 +54,7 @@ class Phase:
     ``part``: the amplitude that reaches the mask, of a coded field.
     """
 
-    held: npt.NDArray[np.bool_] | None = None
+    held: BoolArray | None = None
 
     def __init__(self, model: HologramModel, part: float = 1.0) -> None:
         self.model, self.part = model, part

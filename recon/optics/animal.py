@@ -10,9 +10,8 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
+from recon.arrays import Float64Array
 from recon.optics.scene import Beads, Scene
-
-Floats = npt.NDArray[np.float64]
 
 CELLS, TISSUE, PLANES = 200, 100, 24
 """Cells that may flash, spots of tissue that never do, planes that both lie in."""
@@ -53,14 +52,14 @@ class Animal:
         Of a cell, and of the animal along x.
     """
 
-    cells_um: Floats
-    rest: Floats
-    onsets_s: tuple[Floats, ...]
-    sizes: tuple[Floats, ...]
-    tissue_um: Floats
-    glow: Floats
-    vessel_um: Floats
-    blood_um: Floats
+    cells_um: Float64Array
+    rest: Float64Array
+    onsets_s: tuple[Float64Array, ...]
+    sizes: tuple[Float64Array, ...]
+    tissue_um: Float64Array
+    glow: Float64Array
+    vessel_um: Float64Array
+    blood_um: Float64Array
     diameter_um: float
     length_um: float
 
@@ -76,7 +75,7 @@ class Animal:
         """Along the vessel."""
         return float(np.sum(np.linalg.norm(np.diff(self.vessel_um, axis=0), axis=1)))
 
-    def change(self, time_s: npt.ArrayLike) -> Floats:
+    def change(self, time_s: npt.ArrayLike) -> Float64Array:
         """Return dF/F of all cells, (n_cells, n_times), without bleaching."""
         times = np.atleast_1d(np.asarray(time_s, float))
         course = np.zeros((len(self.cells_um), len(times)))
@@ -88,11 +87,11 @@ class Animal:
                 course[cell] += size * shape / peak
         return course
 
-    def faded(self, time_s: npt.ArrayLike) -> Floats:
+    def faded(self, time_s: npt.ArrayLike) -> Float64Array:
         """Return how much of the light bleaching has left, (n_times,)."""
         return np.exp(-np.atleast_1d(np.asarray(time_s, float)) / BLEACH_S)
 
-    def sway_um(self, time_s: npt.ArrayLike) -> Floats:
+    def sway_um(self, time_s: npt.ArrayLike) -> Float64Array:
         """Return where the animal is, ``(x, y)`` from its mean place, (n_times, 2)."""
         times = np.atleast_1d(np.asarray(time_s, float))
         far = SWAY * self.length_um
@@ -100,14 +99,14 @@ class Animal:
         across = 0.6 * far * np.sin(2 * np.pi * times / 7.0 + 1.0)
         return np.column_stack([along, across])
 
-    def flowed_um(self, time_s: npt.ArrayLike) -> Floats:
+    def flowed_um(self, time_s: npt.ArrayLike) -> Float64Array:
         """Return how far the blood has come since time 0, (n_times,)."""
         times = np.atleast_1d(np.asarray(time_s, float))
         turn = 2 * np.pi * PULSE_HZ
         pulsing = PULSE * (1 - np.cos(turn * times)) / turn
         return SPEED * self.length_um * (times + pulsing)
 
-    def blood(self, time_s: float) -> Floats:
+    def blood(self, time_s: float) -> Float64Array:
         """Return how much light is at each place of the vessel, (n_vessel,)."""
         step = self.vessel_length_um / (len(self.vessel_um) - 1)
         around = len(self.vessel_um) * step
@@ -137,7 +136,7 @@ def draw_animal(z_um: float, height_um: float, seed: int = 0) -> Animal:
     diameter = 0.01 * height_um
     planes = z_um + thickness * (np.arange(PLANES) - (PLANES - 1) / 2) / PLANES
     way = _vessel(length, width, z_um)
-    places: list[Floats] = []
+    places: list[Float64Array] = []
     tries = 0
     while len(places) < CELLS + TISSUE:
         x, y = rng.uniform(-0.5, 0.5, 2) * (length, width)
@@ -169,7 +168,7 @@ def draw_animal(z_um: float, height_um: float, seed: int = 0) -> Animal:
     )
 
 
-def _vessel(length_um: float, width_um: float, z_um: float) -> Floats:
+def _vessel(length_um: float, width_um: float, z_um: float) -> Float64Array:
     """Return the vessel: a shallow wave along the animal, places about half a cell apart."""
     x = np.linspace(-0.45, 0.45, 4000) * length_um
     y = 0.12 * width_um * np.sin(2 * np.pi * x / length_um)

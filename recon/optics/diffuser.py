@@ -5,7 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
+
+from recon.arrays import Float32Array, Float64Array
 
 LINE_D_NM = 589.3
 LINE_F_NM = 486.1
@@ -49,7 +50,7 @@ class Diffuser:
         The diffuser's material and what fills its relief (air, or an index-matching polymer).
     """
 
-    heights_um: npt.NDArray[np.float32]
+    heights_um: Float32Array
     pitch_um: float
     aperture_um: tuple[float, float]
     glass: Glass = POLYCARBONATE
@@ -63,7 +64,7 @@ class Diffuser:
                 f"aperture of {self.aperture_um[0]} x {self.aperture_um[1]} um."
             )
 
-    def slopes(self) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.float32]]:
+    def slopes(self) -> tuple[Float32Array, Float32Array]:
         """Surface slopes along y and x (dimensionless), each of the height map's shape."""
         dy, dx = np.gradient(self.heights_um, np.float32(self.pitch_um))
         return np.asarray(dy, np.float32), np.asarray(dx, np.float32)
@@ -166,9 +167,7 @@ def microlens_diffuser(
     return Diffuser(heights.astype(np.float32), pitch_um, aperture_um, glass, AIR)
 
 
-def _random_centers(
-    rng: np.random.Generator, extent_um: npt.NDArray[np.float64], lenslet_um: float
-) -> npt.NDArray[np.float64]:
+def _random_centers(rng: np.random.Generator, extent_um: Float64Array, lenslet_um: float) -> Float64Array:
     """Random places, one per ``lenslet_um^2`` on average, with no room for another one between them.
 
     Random sequential adsorption: discs of diameter ``c`` saturate at ``0.70 / c^2``, hence the factor 0.83.

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import numpy.typing as npt
 
+from recon.arrays import Float32Array, Float64Array
 from recon.optics.grid import PixelGrid
 
 if TYPE_CHECKING:
@@ -16,11 +17,11 @@ if TYPE_CHECKING:
 COARSE_STEP = 0.004
 """In tangents of the angle; linear interpolation between is exact to 1e-4 for any pixel's response."""
 
-FallOff = Callable[[npt.NDArray[np.float64], npt.NDArray[np.float64]], npt.NDArray[np.float64]]
+FallOff = Callable[[Float64Array, Float64Array], Float64Array]
 """Maps the tangents of the angle of incidence along y and x to a response relative to normal incidence."""
 
 
-def no_fall_off(tan_y: npt.NDArray[np.float64], tan_x: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+def no_fall_off(tan_y: Float64Array, tan_x: Float64Array) -> Float64Array:
     """Respond alike at all angles."""
     return np.ones(np.broadcast_shapes(tan_y.shape, tan_x.shape))
 
@@ -33,7 +34,7 @@ def gaussian_fall_off(sigma_y_deg: float, sigma_x_deg: float | None = None) -> F
     """
     widths = np.deg2rad([sigma_y_deg, sigma_y_deg if sigma_x_deg is None else sigma_x_deg])
 
-    def response(tan_y: npt.NDArray[np.float64], tan_x: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+    def response(tan_y: Float64Array, tan_x: Float64Array) -> Float64Array:
         radius = np.hypot(tan_y, tan_x)
         # theta / tan(theta), 1 on the axis
         shrink = np.arctan(radius) / np.maximum(radius, 1e-12)
@@ -57,7 +58,7 @@ def table_fall_off(angles_deg: npt.ArrayLike, responses: npt.ArrayLike) -> FallO
     if angles[0] != 0 or np.any(np.diff(angles) <= 0) or np.any(values < 0):
         raise ValueError("A fall-off table's angles ascend from 0 degrees, its responses are not negative.")
 
-    def response(tan_y: npt.NDArray[np.float64], tan_x: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+    def response(tan_y: Float64Array, tan_x: Float64Array) -> Float64Array:
         return np.interp(np.arctan(np.hypot(tan_y, tan_x)), angles, values)
 
     return response
@@ -65,7 +66,7 @@ def table_fall_off(angles_deg: npt.ArrayLike, responses: npt.ArrayLike) -> FallO
 
 def response_on(
     grid: PixelGrid, source_um: tuple[float, float, float], distance_um: float, fall_off: FallOff
-) -> npt.NDArray[np.float32]:
+) -> Float32Array:
     """Response of every pixel to light from a source: ``f(atan(|u - x| / (d + z)))`` (Kuo 2020, Eq. 5.1).
 
     Returns
@@ -81,9 +82,7 @@ def response_on(
     return np.asarray(rows @ (columns @ coarse.T).T, np.float32)
 
 
-def _coarse(
-    positions: npt.NDArray[np.float64], step: float
-) -> tuple[npt.NDArray[np.float64], sparse.csr_array]:
+def _coarse(positions: Float64Array, step: float) -> tuple[Float64Array, sparse.csr_array]:
     """Return coarse positions that span the given ones, and the matrix of linear interpolation back."""
     count = int(np.ceil((positions[-1] - positions[0]) / step)) + 2
     coarse = np.linspace(positions[0] - step / 2, positions[-1] + step / 2, count)

@@ -6,12 +6,13 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
-import numpy.typing as npt
+
+from recon.arrays import Float32Array, Float64Array
 
 if TYPE_CHECKING:
     from scipy import sparse
 
-FloatArray = npt.NDArray[np.float64]
+FloatArray = Float64Array
 
 
 @dataclass(frozen=True, slots=True)
@@ -102,13 +103,13 @@ def overlap_matrix(source_edges: FloatArray, target_edges: FloatArray) -> sparse
 
 
 def resample_energy(
-    energy: npt.NDArray[np.float32],
+    energy: Float32Array,
     y_edges: FloatArray,
     x_edges: FloatArray,
     target_y_edges: FloatArray,
     target_x_edges: FloatArray,
     shifts: FloatArray | None = None,
-) -> npt.NDArray[np.float32]:
+) -> Float32Array:
     """Move the content of one rectangular grid's cells into another's by overlapping area.
 
     Parameters

@@ -5,13 +5,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-import numpy.typing as npt
 
+from recon.arrays import Float32Array
 from recon.optics.fall_off import FallOff, response_on
 from recon.optics.grid import FloatArray, PixelGrid, Spectrum
 from recon.optics.wave import Caustic, Source, WavePropagator
-
-Image = npt.NDArray[np.float32]
 
 
 class NearPsfs:
@@ -58,14 +56,14 @@ class NearPsfs:
             ).energy
         self._pitch_um = pitch
 
-    def __call__(self, source_um: Source) -> Image:
+    def __call__(self, source_um: Source) -> Float32Array:
         """Return the light of a source of unit intensity on the pixels, as ``WavePropagator.psf`` does.
 
         With the angular response. Raises ValueError for a place outside the nodes.
         """
         weights = [_between(along, at) for along, at in zip(self._nodes, source_um, strict=True)]
         light = np.zeros(self._grid.shape, np.float32)
-        parts: dict[tuple[int, int], Image] = {}
+        parts: dict[tuple[int, int], Float32Array] = {}
         for i, along_x in weights[0]:
             for j, along_y in weights[1]:
                 for k, along_z in weights[2]:
@@ -78,7 +76,7 @@ class NearPsfs:
         light *= response_on(self._grid, source_um, self._propagator.distance_um, self._fall_off)
         return light
 
-    def _laid(self, energy: Image, source_um: Source) -> Caustic:
+    def _laid(self, energy: Float32Array, source_um: Source) -> Caustic:
         """Lay light on the straight rays of a source through samples about the diffuser's centre."""
         x, y, z = source_um
         magnification = self._propagator.distance_um / z

@@ -16,8 +16,8 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
+from recon.arrays import Float32Array, Float64Array
 from recon.base.fft import fast_shape, irfft_strip, multiply, rfft_strip, spectrum_shape
 from recon.base.threads import get_threads, one_of_several
 from recon.optics.fall_off import FallOff, response_on
@@ -25,7 +25,6 @@ from recon.optics.grid import FloatArray, PixelGrid, mixed_spectrum
 from recon.optics.scene import Layer, Scene
 from recon.optics.wave import WavePropagator
 
-Image = npt.NDArray[np.float32]
 Weights = tuple[float, float, float]
 
 
@@ -56,7 +55,7 @@ def render(
     layer_photons: float,
     bead_photons: float,
     settings: RenderSettings | None = None,
-) -> Image:
+) -> Float32Array:
     """Photons a second on every pixel of a sensor.
 
     Parameters
@@ -86,7 +85,7 @@ def render(
     # Transforms leave rounding errors around zero where it is dark.
     np.maximum(image, 0, out=image)
 
-    def bead(point: tuple[FloatArray, FloatArray, float]) -> Image | None:
+    def bead(point: tuple[FloatArray, FloatArray, float]) -> Float32Array | None:
         place, power, diameter = point
         source = (float(place[0]), float(place[1]), float(place[2]))
         spectrum = mixed_spectrum(product(weights, power), settings.spectral_samples)
@@ -103,7 +102,7 @@ def render(
     return image
 
 
-def product(weights: Weights, power: Sequence[float] | npt.NDArray[np.float64]) -> Weights:
+def product(weights: Weights, power: Sequence[float] | Float64Array) -> Weights:
     """Return sensitivities to red, green and blue times the power in each."""
     red, green, blue = (w * float(p) for w, p in zip(weights, power, strict=True))
     return red, green, blue
@@ -116,7 +115,7 @@ def _render_layer(
     propagator: WavePropagator,
     fall_off: FallOff,
     settings: RenderSettings,
-) -> Image:
+) -> Float32Array:
     """Sum over bands; one pass suffices where the picture is grey, as then only brightness varies."""
     red, green, blue = np.moveaxis(layer.radiance, 2, 0)
     if np.array_equal(red, green) and np.array_equal(green, blue):
@@ -160,7 +159,7 @@ class _LayerRenderer:
         self.cells_x = self._cells(1, layer.x_edges_um)
         self.flux = self._flux(pick)
 
-    def render(self) -> Image:
+    def render(self) -> Float32Array:
         image = np.zeros(self.fine.shape, np.float32)
         if self.flux.any():
             nodes_y, nodes_x = self._nodes()
@@ -176,7 +175,7 @@ class _LayerRenderer:
         tiles = image.reshape(height // factor, factor, width // factor, factor)
         return np.asarray(tiles.sum(axis=(1, 3)), np.float32)
 
-    def _cells(self, axis: int, edges_um: npt.NDArray[np.float64]) -> range:
+    def _cells(self, axis: int, edges_um: Float64Array) -> range:
         """Cells (multiples of the fine pitch) that hold any of the picture and can reach the sensor."""
         pitch = self.fine.pitch_um
         center = self.fine.center_um[1 - axis]
@@ -186,7 +185,7 @@ class _LayerRenderer:
         high = min(int(np.ceil(on_sensor[1] - 0.5)), int(np.ceil(reach)))
         return range(low, max(low, high) + 1)
 
-    def _flux(self, pick: Weights) -> Image:
+    def _flux(self, pick: Weights) -> Float32Array:
         """Radiance times area in every cell."""
         pitch = self.fine.pitch_um
         borders = []
@@ -195,7 +194,7 @@ class _LayerRenderer:
             borders.append(np.asarray(-on_sensor[::-1] / self.magnification, np.float64))
         return np.ascontiguousarray(self.layer.flux(pick, borders[0], borders[1])[::-1, ::-1])
 
-    def _nodes(self) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
+    def _nodes(self) -> tuple[Float64Array, Float64Array]:
         """Node positions along y and x, in cells."""
         settings, distance_um = self.settings, self.propagator.distance_um
         pitch = self.fine.pitch_um
@@ -214,10 +213,10 @@ class _LayerRenderer:
             tolerance *= 1.2
             widest *= 1.1
 
-    def _vignetting_ratio(self, nodes_y: npt.NDArray[np.float64], nodes_x: npt.NDArray[np.float64]) -> Image:
+    def _vignetting_ratio(self, nodes_y: Float64Array, nodes_x: Float64Array) -> Float32Array:
         """Return the light collected from every cell over what the nodes, interpolated, make of it."""
 
-        def collected(t_y: npt.NDArray[np.float64], t_x: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+        def collected(t_y: Float64Array, t_x: Float64Array) -> Float64Array:
             to_tangent = self.fine.pitch_um / self.propagator.distance_um
             tan_y, tan_x = t_y[:, None] * to_tangent, t_x * to_tangent
             return np.asarray(self.fall_off(tan_y, tan_x) / (1 + tan_y**2 + tan_x**2) ** 2)
@@ -233,8 +232,8 @@ class _LayerRenderer:
         )
 
     def _node(
-        self, nodes_y: npt.NDArray[np.float64], j: int, nodes_x: npt.NDArray[np.float64], i: int
-    ) -> tuple[Image, int, int] | None:
+        self, nodes_y: Float64Array, j: int, nodes_x: Float64Array, i: int
+    ) -> tuple[Float32Array, int, int] | None:
         """Return the light of the cells around a node, and where it lies on the fine pixels."""
         weight_y, first_y = _hat(nodes_y, j, self.cells_y)
         weight_x, first_x = _hat(nodes_x, i, self.cells_x)
@@ -262,7 +261,7 @@ class _LayerRenderer:
         left = first_x + (self.fine.shape[1] - kernel.shape[1]) // 2
         return light, top, left
 
-    def _kernel(self, node_y: float, node_x: float) -> Image:
+    def _kernel(self, node_y: float, node_x: float) -> Float32Array:
         """Point spread function of a node on fine pixels about its straight ray."""
         pitch = self.fine.pitch_um
         center = (self.fine.center_um[0] + node_x * pitch, self.fine.center_um[1] + node_y * pitch)
@@ -288,14 +287,14 @@ def _finer(layer: Layer, grid: PixelGrid, magnification: float) -> bool:
 def _fall_off_spacing(fall_off: FallOff, tolerance: float) -> float:
     """Spacing, in tangents, at which linear interpolation of the response errs by the tolerance."""
     step = 0.05
-    tangents: npt.NDArray[np.float64] = np.linspace(-20 * step, 20 * step, 41)
+    tangents: Float64Array = np.linspace(-20 * step, 20 * step, 41)
     curvature = 0.0
     for response in (fall_off(tangents, np.zeros(1)), fall_off(np.zeros(1), tangents)):
         curvature = max(curvature, float(np.abs(np.diff(response, 2)).max()) / step**2)
     return float(np.sqrt(8 * tolerance / max(curvature, 1e-9)))
 
 
-def _nodes_between(low: float, high: float, tolerance: float, widest: float) -> npt.NDArray[np.float64]:
+def _nodes_between(low: float, high: float, tolerance: float, widest: float) -> Float64Array:
     """Positions from ``low`` to ``high``, the steps between them inverse to the distance from the axis."""
     if high - low < 1e-9:
         return np.array([(low + high) / 2])
@@ -307,7 +306,7 @@ def _nodes_between(low: float, high: float, tolerance: float, widest: float) -> 
     return _march(high, tolerance, widest, low)
 
 
-def _march(end: float, tolerance: float, widest: float, start: float) -> npt.NDArray[np.float64]:
+def _march(end: float, tolerance: float, widest: float, start: float) -> Float64Array:
     """Step outwards from ``start`` until ``end`` is reached: pictures of any size share their nodes."""
     positions = [start]
     while positions[-1] < end:
@@ -315,7 +314,7 @@ def _march(end: float, tolerance: float, widest: float, start: float) -> npt.NDA
     return np.asarray(positions)
 
 
-def _hat(nodes: npt.NDArray[np.float64], index: int, cells: range) -> tuple[Image, int]:
+def _hat(nodes: Float64Array, index: int, cells: range) -> tuple[Float32Array, int]:
     """Weights of linear interpolation for one node, and the first cell they belong to."""
     position = np.arange(cells.start, cells.stop)
     unit = np.zeros(len(nodes))
@@ -327,7 +326,7 @@ def _hat(nodes: npt.NDArray[np.float64], index: int, cells: range) -> tuple[Imag
     return weights[used[0] : used[-1] + 1].astype(np.float32), cells.start + int(used[0])
 
 
-def _add_clipped(image: Image, light: Image, top: int, left: int) -> None:
+def _add_clipped(image: Float32Array, light: Float32Array, top: int, left: int) -> None:
     """Add ``light`` to ``image`` at a place that may stick out."""
     height, width = light.shape
     first_row, first_column = max(0, -top), max(0, -left)

@@ -16,6 +16,7 @@ import numpy.typing as npt
 import scipy.fft
 from scipy import ndimage
 
+from recon.arrays import Float32Array
 from recon.optics.jit import compiled
 
 _BEYOND = 16
@@ -24,7 +25,6 @@ _TAPS, _STEPS = 8, 512
 """Samples that an interpolated one is made of, and places between two that have weights of their own."""
 
 Complex = npt.NDArray[np.complex64]
-Image = npt.NDArray[np.float32]
 
 
 @dataclass(frozen=True, slots=True)
@@ -142,7 +142,7 @@ class ScatteringDisplay:
         phase_rad: npt.NDArray[np.floating],
         pose: MaskPose,
         amplitude: npt.NDArray[np.floating] | None = None,
-    ) -> Image:
+    ) -> Float32Array:
         """Return the light on the camera's pixels, float32 (height, width).
 
         In units of the mean over the field of view that an ideal SLM without losses would give.
@@ -221,7 +221,7 @@ class ScatteringDisplay:
             field += depth_mm * scipy.fft.ifft2(slope, overwrite_x=True)
         return np.asarray(field, np.complex64)
 
-    def _on_sensor(self, field: Complex, mask_roll_mrad: float) -> Image:
+    def _on_sensor(self, field: Complex, mask_roll_mrad: float) -> Float32Array:
         """Fourier transform by the lens, stop at the field of view, integrate over camera pixels.
 
         The far field turns with the mask, the camera stays. Its intensity has the aperture's auto-correlation
@@ -272,7 +272,7 @@ def _finer(values: npt.NDArray[np.floating], parts: int) -> npt.NDArray[np.float
     return np.repeat(np.repeat(values, parts, axis=0), parts, axis=1)
 
 
-def _wavefront(shape: tuple[int, ...], seed: int) -> npt.NDArray[np.float32]:
+def _wavefront(shape: tuple[int, ...], seed: int) -> Float32Array:
     """Return random aberrations of second to fourth order over an aperture, mean 0, rms 1."""
     rng = np.random.default_rng(seed)
     y, x = (np.linspace(-1, 1, n) * n / max(shape) for n in shape)
@@ -285,7 +285,7 @@ def _wavefront(shape: tuple[int, ...], seed: int) -> npt.NDArray[np.float32]:
     return np.asarray(total / total.std(), np.float32)
 
 
-def _taps() -> Image:
+def _taps() -> Float32Array:
     """Return the weights of ``_TAPS`` samples for every ``1 / _STEPS`` between two of them, sum 1."""
     away = np.arange(_TAPS) - (_TAPS // 2 - 1) - np.arange(_STEPS + 1)[:, None] / _STEPS
     taper = np.i0(6.0 * np.sqrt(np.clip(1 - (2 * away / _TAPS) ** 2, 0, None)))
@@ -345,7 +345,7 @@ def _propagate(spectrum: Complex, down: Complex, across: Complex) -> None:
 
 
 @compiled
-def _slope(spectrum: Complex, slope: Complex, fy2: Image, fx2: Image) -> None:
+def _slope(spectrum: Complex, slope: Complex, fy2: Float32Array, fx2: Float32Array) -> None:
     """Write the derivative of a spectrum with respect to distance."""
     for i in range(spectrum.shape[0]):
         for j in range(spectrum.shape[1]):
@@ -355,9 +355,9 @@ def _slope(spectrum: Complex, slope: Complex, fy2: Image, fx2: Image) -> None:
 
 @compiled
 def _read(
-    light: Image,
-    taps: Image,
-    sensor: Image,
+    light: Float32Array,
+    taps: Float32Array,
+    sensor: Float32Array,
     cells: tuple[int, int],
     pixel: float,
     offset: tuple[float, float],

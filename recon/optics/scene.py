@@ -13,10 +13,10 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 import numpy.typing as npt
 
+from recon.arrays import Float32Array, Float64Array
 from recon.optics.fall_off import FallOff
 from recon.optics.grid import FloatArray, resample_energy
 
-Image = npt.NDArray[np.float32]
 Weights = tuple[float, float, float]
 
 
@@ -36,7 +36,7 @@ class Layer:
         ``(x, y)`` of its centre.
     """
 
-    radiance: Image
+    radiance: Float32Array
     z_um: float
     size_um: tuple[float, float]
     center_um: tuple[float, float] = (0.0, 0.0)
@@ -57,7 +57,9 @@ class Layer:
         """Borders of the rows, ``(height + 1,)``."""
         return _edges(self.center_um[1], self.size_um[0], self.radiance.shape[0])
 
-    def flux(self, weights: tuple[float, float, float], y_edges: FloatArray, x_edges: FloatArray) -> Image:
+    def flux(
+        self, weights: tuple[float, float, float], y_edges: FloatArray, x_edges: FloatArray
+    ) -> Float32Array:
         """Radiance integrated over the cells of another grid in the layer's plane.
 
         Parameters
@@ -240,7 +242,7 @@ def true_scene(
     light: Weights,
     sensitivity: Weights | None,
     fall_off: FallOff | None,
-) -> npt.NDArray[np.float32]:
+) -> Float32Array:
     """Sample a scene on a reconstruction's grid, for each depth plane and colour.
 
     Parameters
@@ -283,7 +285,7 @@ def true_scene(
     return np.asarray(planes[0] if z_um is None else np.stack(planes), np.float32)
 
 
-def _tangents(count: int, step: float) -> npt.NDArray[np.float64]:
+def _tangents(count: int, step: float) -> Float64Array:
     return np.asarray((np.arange(count) - count // 2) * step, np.float64)
 
 
@@ -343,7 +345,7 @@ def bead_volume(
     return Scene("beads", beads=(Beads(np.column_stack([across, z]), powers, diameter_um),))
 
 
-def bar_target(pixels: int = 512) -> Image:
+def bar_target(pixels: int = 512) -> Float32Array:
     """Draw groups of three horizontal and three vertical bars, each group finer than the one before.
 
     Returns
@@ -399,7 +401,7 @@ def tilted_target(image: npt.ArrayLike, z_um: float, width_um: float, tilt_deg: 
     return Scene("tilted bar target", layers=tuple(layers))
 
 
-def _fill(image: Image, left: float, right: float, top: float, bottom: float) -> None:
+def _fill(image: Float32Array, left: float, right: float, top: float, bottom: float) -> None:
     side = image.shape[0]
     rows = slice(round(top * side), round(bottom * side))
     image[rows, round(left * side) : round(right * side)] = 1

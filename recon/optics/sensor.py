@@ -16,6 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
+from recon.arrays import Float32Array
 from recon.base.blocks import block_mean, block_sum
 from recon.base.threads import in_blocks
 from recon.optics.sensor_kernel import expose_pixels
@@ -54,10 +55,10 @@ class SensorSpec:
 class FixedPattern:
     """One sensor's pixels as they came out of the fab (all ``(h, w)`` float32)."""
 
-    response: npt.NDArray[np.float32]
+    response: Float32Array
     """Relative response; 0 for dead pixels. Binned: the mean of the pixels summed."""
-    dark_e_per_s: npt.NDArray[np.float32]
-    offset_e: npt.NDArray[np.float32]
+    dark_e_per_s: Float32Array
+    offset_e: Float32Array
 
     def binned(self, factor: int) -> FixedPattern:
         """Sum ``factor x factor`` pixels; a rest at the lower and right border is left out."""
@@ -114,7 +115,7 @@ class Readout:
 
 
 def expose(
-    electrons_per_s: npt.NDArray[np.float32],
+    electrons_per_s: Float32Array,
     pattern: FixedPattern,
     exposure_s: float,
     readout: Readout,

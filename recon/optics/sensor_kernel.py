@@ -11,6 +11,7 @@ import math
 import numpy as np
 import numpy.typing as npt
 
+from recon.arrays import Float32Array, Float64Array
 from recon.optics.jit import compiled
 
 LAYERS = 128
@@ -21,7 +22,7 @@ EXPANSION_FROM = 30.0
 """Mean from which Poisson deviates come from a normal one (Cornish-Fisher, third order)."""
 
 
-def _ziggurat() -> tuple[npt.NDArray[np.int64], npt.NDArray[np.float64], npt.NDArray[np.float64]]:
+def _ziggurat() -> tuple[npt.NDArray[np.int64], Float64Array, Float64Array]:
     """Borders as integers, widths per integer step, and densities of the layers."""
     scale = 2.0**31
     border, width, density = np.zeros(LAYERS, np.int64), np.zeros(LAYERS), np.zeros(LAYERS)
@@ -109,10 +110,10 @@ def poisson_small(mean: float, uniform: float) -> float:
 
 @compiled
 def expose_pixels(
-    electrons_per_s: npt.NDArray[np.float32],
-    response: npt.NDArray[np.float32],
-    dark_e_per_s: npt.NDArray[np.float32],
-    offset_e: npt.NDArray[np.float32],
+    electrons_per_s: Float32Array,
+    response: Float32Array,
+    dark_e_per_s: Float32Array,
+    offset_e: Float32Array,
     exposure_s: float,
     counts_per_electron: float,
     black_level: float,

@@ -27,6 +27,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
+from recon.arrays import Float32Array
 from recon.base.fft import fast_length
 from recon.base.threads import in_blocks, over_rows
 from recon.optics.diffuser import Diffuser
@@ -65,11 +66,11 @@ class Caustic:
         Borders of the cells on the sensor.
     """
 
-    energy: npt.NDArray[np.float32]
+    energy: Float32Array
     y_edges_um: FloatArray
     x_edges_um: FloatArray
 
-    def on(self, grid: PixelGrid, *, cell: bool = False) -> npt.NDArray[np.float32]:
+    def on(self, grid: PixelGrid, *, cell: bool = False) -> Float32Array:
         """Integrate over the pixels of a sensor grid; ``grid.shape``, float32.
 
         ``cell``: of the square that one pixel looks at, evenly bright, together as bright as the point.
@@ -110,7 +111,7 @@ class WavePropagator:
         slope = np.hypot(*diffuser.slopes())
         self._typical_slope = float(np.sqrt((slope**2).mean()))
         self._steepest = float(np.quantile(slope, 0.9995))
-        self._kept: OrderedDict[Any, npt.NDArray[np.float32]] = OrderedDict()
+        self._kept: OrderedDict[Any, Float32Array] = OrderedDict()
         self._lock = threading.Lock()
 
     def psf(
@@ -122,7 +123,7 @@ class WavePropagator:
         diameter_um: float = 0.0,
         emission: Emission = "lambertian",
         cell: bool = False,
-    ) -> npt.NDArray[np.float32]:
+    ) -> Float32Array:
         """Light of a point source (or small disc, or square cell) on the pixels of a sensor grid.
 
         Parameters
@@ -265,7 +266,7 @@ class WavePropagator:
 
     def _add_tile(
         self,
-        energy: npt.NDArray[np.float32],
+        energy: Float32Array,
         tile: _Tile,
         source_um: Source,
         margin: int,
@@ -341,7 +342,7 @@ def _propagate(field: ComplexArray, tile: _Tile, pitch: float, strength: float) 
     in_blocks(some, -(-width // kernels.COLUMNS))
 
 
-def disc_kernel(diameter: float) -> npt.NDArray[np.float32]:
+def disc_kernel(diameter: float) -> Float32Array:
     """Uniform disc of a diameter in samples, area-sampled; sums to 1."""
     half = int(np.ceil(diameter / 2))
     fine = 8
@@ -372,7 +373,7 @@ def _split(span: range, parts: int) -> list[range]:
 
 def _window(
     span: range, margin: int, samples: int, pitch: float, aperture_um: float
-) -> tuple[int, npt.NDArray[np.float32], int] | None:
+) -> tuple[int, Float32Array, int] | None:
     """Amplitude along one axis of what lights the samples ``span``: aperture and soft cut.
 
     Returns

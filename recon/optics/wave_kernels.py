@@ -10,11 +10,12 @@ import numpy as np
 import numpy.typing as npt
 from rocket_fft import c2c
 
+from recon.arrays import Float32Array, Float64Array
 from recon.optics.jit import compiled
 
-FloatArray = npt.NDArray[np.float64]
+FloatArray = Float64Array
 ComplexArray = npt.NDArray[np.complex64]
-Pairs = npt.NDArray[np.float32]
+Pairs = Float32Array
 """Complex numbers as ``.view(np.float32)``: (h, 2 w), real and imaginary parts in turn."""
 
 # The direction of incidence varies so slowly over the diffuser that it is evaluated every so many samples and
@@ -27,9 +28,9 @@ COLUMNS = 64
 @compiled
 def modulate(
     field: Pairs,
-    heights: npt.NDArray[np.float32],
-    row_window: npt.NDArray[np.float32],
-    column_window: npt.NDArray[np.float32],
+    heights: Float32Array,
+    row_window: Float32Array,
+    column_window: Float32Array,
     first_row: int,
     first_column: int,
     pitch: float,
@@ -86,9 +87,9 @@ def modulate(
 def _turned(
     out: Pairs,
     half_turns: FloatArray,
-    relief: npt.NDArray[np.float32],
-    amplitude: npt.NDArray[np.float32],
-    window: npt.NDArray[np.float32],
+    relief: Float32Array,
+    amplitude: Float32Array,
+    window: Float32Array,
 ) -> None:
     """Write ``amplitude window exp(i pi half_turns relief)``."""
     for j in range(len(relief)):
@@ -181,7 +182,7 @@ def propagate(
 
 
 @compiled
-def add_intensity(energy: npt.NDArray[np.float32], field: Pairs, weight: float) -> None:
+def add_intensity(energy: Float32Array, field: Pairs, weight: float) -> None:
     """Add ``weight |field|^2`` to ``energy``."""
     share = np.float32(weight)
     for i in range(energy.shape[0]):

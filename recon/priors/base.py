@@ -9,13 +9,11 @@ from numbers import Real
 from typing import Any, Self
 
 import numpy as np
-import numpy.typing as npt
 
+from recon.arrays import Array
 from recon.base.arguments import require_argument
 from recon.errors import InputError, StructureError
 from recon.types import plain_number
-
-Array = npt.NDArray[Any]
 
 
 def refuse_lookalike(prior: object) -> None:

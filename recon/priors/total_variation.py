@@ -7,8 +7,9 @@ from typing import Any, Self
 import numpy as np
 import numpy.typing as npt
 
+from recon.arrays import Array
 from recon.base.namespace import namespace_of
-from recon.camera.base import Array, LinearOperator
+from recon.camera.base import LinearOperator
 from recon.priors.base import Prior, Separable, Zero, require_weight
 
 

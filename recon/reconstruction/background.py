@@ -12,11 +12,10 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
+from recon.arrays import Array, Float32Array, Float64Array
 from recon.base.blocks import whole_blocks
 from recon.camera.camera_model import CAMERAS
 from recon.camera.vignetting import DEEPEST, least_squares, shade_of
@@ -31,8 +30,6 @@ from recon.reconstruction.problem import Problem
 from recon.reconstruction.reduction import on_blocks, reduced_calibration
 from recon.reconstruction.solvers import SOLVERS
 from recon.reconstruction.weights import kind_of
-
-Floats = npt.NDArray[np.float64]
 
 ITERATIONS, PLAIN_ITERATIONS = 20, 120
 """Of a trial's passes. The splitting of one convolution without a background begins far from the data, in a
@@ -104,7 +101,7 @@ DARKEST, DARKEST_PERCENTILE = 0.05, 1
 measured photograph whose darkest hundredth has 0.02 the error fell by 31 to 49 %, and 4.2 dB were lost."""
 
 
-def floor(data: npt.NDArray[Any], percentile: float = FLOOR_PERCENTILE) -> float:
+def floor(data: Array, percentile: float = FLOOR_PERCENTILE) -> float:
     """Return the darkest part of some block means relative to their mean."""
     mean = float(data.mean(dtype=np.float64))
     return float(np.percentile(data, percentile)) / mean if mean > 0 else 0.0
@@ -379,21 +376,21 @@ class _Small:
         self.usual2 = np.array([MODEL_ERROR**2 * max(u.var() - 1, 0.0) for u in used])
         """Besides noise, in its units."""
 
-    def left2(self, share: float) -> Floats:
+    def left2(self, share: float) -> Float64Array:
         """Return the mean squares that they leave with an offset, relative to their mean."""
         each = zip(self.channels, self.noise, strict=True)
         return np.array([_left2(c, share * self.mean / n) for c, n in each])
 
-    def beyond(self, left2: Floats, least: Floats | float = 0.0) -> float:
+    def beyond(self, left2: Float64Array, least: Float64Array | float = 0.0) -> float:
         """Return mean squares beyond the least in units of what calibrated cameras leave."""
         return float(np.mean((left2 - least) / (1 + self.usual2)))
 
-    def lacks(self, left2: Floats, least: Floats | float = 0.0) -> bool:
+    def lacks(self, left2: Float64Array, least: Float64Array | float = 0.0) -> bool:
         """Whether that is more than they leave."""
         return self.beyond(left2, least) > 1
 
 
-def _shade_of(small: _Small, given: Floats) -> Floats | None:
+def _shade_of(small: _Small, given: Float64Array) -> Float64Array | None:
     """Return the numbers of the least shade by which the channels are explained as a rule; None: none is.
 
     None where the PSF stands on an offset, too: what that lacks looks like a shade. One for all, fitted to
@@ -414,7 +411,7 @@ def _shade_of(small: _Small, given: Floats) -> Floats | None:
     if numbers is None:
         return None
 
-    def left2(share: float) -> Floats:
+    def left2(share: float) -> Float64Array:
         shade = shade_of(share * numbers, shape)
         each = [np.mean(_shade_left(c, shade, LOOKED)[c.valid[0]] ** 2) for c in small.channels]
         return np.array(each, np.float64)
@@ -429,7 +426,7 @@ def _shade_of(small: _Small, given: Floats) -> Floats | None:
     return share * numbers if fallen > -TELLING * float(np.log(least)) else None
 
 
-def _shade_fitted(channel: Problem, usual2: float) -> Floats | None:
+def _shade_fitted(channel: Problem, usual2: float) -> Float64Array | None:
     """Return the numbers of the shade through which a small copy's PSF explains it best (:func:`shade_of`).
 
     None where it would be as deep as can be: so is what stray light is taken for.
@@ -442,20 +439,20 @@ def _shade_fitted(channel: Problem, usual2: float) -> Floats | None:
         Mean square that a calibrated camera leaves of it as a rule, noise included, in units of the noise.
     """
 
-    def left(numbers: Floats) -> Floats:
+    def left(numbers: Float64Array) -> Float64Array:
         shade = shade_of(numbers, channel.sensor_shape)
         return _shade_left(channel, shade, SHADE_ITERATIONS).ravel() / float(usual2**0.5)
 
-    def is_deepest(numbers: Floats) -> bool:
+    def is_deepest(numbers: Float64Array) -> bool:
         return bool(shade_of(numbers, channel.sensor_shape).min() <= np.float32(DEEPEST))
 
     return least_squares(left, is_deepest)
 
 
-def _shade_left(channel: Problem, shade: npt.NDArray[np.float32], iterations: int) -> Floats:
+def _shade_left(channel: Problem, shade: Float32Array, iterations: int) -> Float64Array:
     """Return what a channel under a shade leaves of its data, (height, width), in units of the noise."""
     found = pilot(replace(channel, data=channel.data / shade), iterations)
-    left: Floats = np.where(channel.valid[0], found.left[0].astype(np.float64) * shade, 0)
+    left: Float64Array = np.where(channel.valid[0], found.left[0].astype(np.float64) * shade, 0)
     return left
 
 
@@ -468,7 +465,7 @@ def _least(lacks: Callable[[float], bool], most: float, halvings: int) -> float:
     return high
 
 
-def _offset_of(small: _Small, explained: Floats) -> float:
+def _offset_of(small: _Small, explained: Float64Array) -> float:
     """Return the least offset by which the channels leave what the largest leaves, relative to their mean.
 
     One number for all: a dark level is the camera's. 0 where the largest explains nothing.

@@ -3,19 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
+from recon.arrays import Array, Float32Array, Float64Array
 from recon.base.noise import estimate_deviation
 from recon.errors import InputError
 from recon.reconstruction.choice import Decision
 from recon.reconstruction.options import Overrides
 from recon.types import Calibration
-
-Array = npt.NDArray[Any]
-Floats = npt.NDArray[np.float32]
 
 CHANNEL_NOISE = 1.1
 """Misfit, in units of the noise, up to which colour channels are taken to be proportional."""
@@ -42,18 +38,18 @@ class Colours:
         The same of the PSFs, relative to them.
     """
 
-    scene: npt.NDArray[np.float64]
-    psf: npt.NDArray[np.float64]
-    weights: npt.NDArray[np.float64]
+    scene: Float64Array
+    psf: Float64Array
+    weights: Float64Array
     misfit: float
     psf_misfit: float
 
-    def merged(self, channels: Array, gains: npt.NDArray[np.float64]) -> Floats:
+    def merged(self, channels: Array, gains: Float64Array) -> Float32Array:
         """Return one image of channels (..., n_channels, height, width) that are ``gains`` times it."""
         weights = self.weights / float(self.weights @ gains)
         return np.asarray(np.tensordot(weights, channels, axes=([0], [-3])), np.float32)
 
-    def spread(self, image: Array) -> Floats:
+    def spread(self, image: Array) -> Float32Array:
         """Return an object of all channels, channels last."""
         return np.asarray(np.asarray(image)[..., None] * (self.scene / self.psf), np.float32)
 
@@ -90,7 +86,7 @@ def colours(data: Array, noise: Array, valid: Array, psfs: Array) -> Colours | N
     return Colours(scene / scene.mean(), psf / psf.mean(), weights * scene.mean(), misfit, psf_misfit)
 
 
-def _proportional(rows: npt.NDArray[np.float64]) -> tuple[npt.NDArray[np.float64], float]:
+def _proportional(rows: Float64Array) -> tuple[Float64Array, float]:
     """Best factors of one pattern, and the root mean square that they leave, per degree of freedom."""
     values, vectors = np.linalg.eigh(rows @ rows.T)
     factors = vectors[:, -1] * np.sign(vectors[:, -1].sum())

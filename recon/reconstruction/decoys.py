@@ -7,9 +7,9 @@ from dataclasses import dataclass, replace
 from itertools import count
 
 import numpy as np
-import numpy.typing as npt
 
 from recon.analysis.resolution import lateral_resolution
+from recon.arrays import Float32Array
 from recon.base.blocks import block_mean
 from recon.base.checks import SATURATED_LIGHT, saturated_light, saturated_share
 from recon.base.threads import linear_algebra_on_one_thread
@@ -37,8 +37,6 @@ from recon.verdict.calibration_check import (
     near_decoys,
 )
 from recon.verdict.coded import SPEAKS, STRAIGHTER, coded
-
-Floats = npt.NDArray[np.float32]
 
 QUICK, THOROUGH = (100, 10), (160, 20)
 """Longest side, about, pixels, and iterations (half as many of volumes). Most right ones are far ahead of
@@ -366,12 +364,12 @@ def _coded(
     if small.model == "local":
         return None
 
-    def tried(photograph: Floats, psfs: Floats) -> _Small:
+    def tried(photograph: Float32Array, psfs: Float32Array) -> _Small:
         raw = photograph is small.photograph.image
         seen = small.photograph if raw else replace(small.photograph, image=photograph, noise=None)
         return replace(small, photograph=seen, calibration=replace(small.calibration, psfs=psfs))
 
-    def left(photograph: Floats, psfs: Floats) -> float:
+    def left(photograph: Float32Array, psfs: Float32Array) -> float:
         return tried(photograph, psfs).unexplained(background=lit)
 
     both = np.asarray(small.photograph.image), small.calibration.psfs
@@ -396,7 +394,7 @@ def _given(problem: Problem) -> Problem:
     return problem if problem.reduction is None else problem.reduction.given
 
 
-def _on_sensor(psfs: Floats, shape: tuple[int, int]) -> Floats:
+def _on_sensor(psfs: Float32Array, shape: tuple[int, int]) -> Float32Array:
     """Return PSFs that were cut to a central window on the sensor's pixels."""
     whole = np.zeros((*psfs.shape[:2], *shape), np.float32)
     top, left = (n // 2 - m // 2 for n, m in zip(shape, psfs.shape[2:], strict=True))

@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from recon.arrays import Array, BoolArray, Float32Array, Float64Array
 from recon.base.brief import brief
 from recon.base.checks import (
     NEIGHBOURS,
@@ -26,8 +27,6 @@ from recon.errors import InputError
 from recon.reconstruction.options import ReconstructionOptions
 from recon.types import Calibration, plain_array, real_array
 
-Array = npt.NDArray[Any]
-Floats = npt.NDArray[np.float32]
 Noise = NoiseModel | float | None
 
 LEAST_NOISE = 1e-5
@@ -120,13 +119,13 @@ class Measurement:
         said = f"{np.count_nonzero(holes)} pixels of the measurement are NaN{masked}: they are erased."
         return replace(self, image=filled, erasures=np.maximum(erased, holes)), said
 
-    def channels(self) -> Floats:
+    def channels(self) -> Float32Array:
         """Return the image as it came, channels first; under patterns each channel's frames in turn."""
         if self.patterns is None:
             return as_channels(self.image, "measurement", MARKED, "Make bad pixels NaN: erased.")
         return _frames(self.image, self.light())
 
-    def light(self) -> Floats:
+    def light(self) -> Float32Array:
         """Return the patterns, checked.
 
         Raises InputError when they are no patterns.
@@ -157,7 +156,7 @@ class Measurement:
         )
         return Counts(data, valid, warnings)
 
-    def light_of(self, counts: Floats) -> Floats:
+    def light_of(self, counts: Float32Array) -> Float32Array:
         """Return channels less their background and what lines share, and divided by the vignetting.
 
         Raises InputError where either is shaped otherwise, or the vignetting is no relative light.
@@ -179,7 +178,7 @@ class Measurement:
             counts = counts / shade
         return counts
 
-    def like(self, image: npt.ArrayLike, data: Floats, name: str) -> Floats:
+    def like(self, image: npt.ArrayLike, data: Float32Array, name: str) -> Float32Array:
         """Broadcast a number, one image, or one for each channel (under patterns: each frame) to the data.
 
         Raises InputError when it is shaped otherwise.
@@ -208,7 +207,7 @@ class Measurement:
             )
         return np.broadcast_to(channels, data.shape)
 
-    def _erased(self, data: Floats) -> npt.NDArray[np.bool_]:
+    def _erased(self, data: Float32Array) -> BoolArray:
         """Return the erasures as a mask of the data's shape."""
         expected = (
             "a mask of the measurement's pixels is expected, True (or 1) where one is erased, else False"
@@ -218,12 +217,12 @@ class Measurement:
         mask = self.like(self.erasures, data, "erasures")
         if not np.isin(mask, (0, 1)).all():
             raise InputError(f"erasures holds values from {mask.min():g} to {mask.max():g}: {expected}.")
-        erased: npt.NDArray[np.bool_] = mask != 0
+        erased: BoolArray = mask != 0
         return erased
 
-    def deviations(self, counts: Counts) -> npt.NDArray[np.float64]:
+    def deviations(self, counts: Counts) -> Float64Array:
         """Return every channel's noise deviation, counts; under patterns its frames' root mean square."""
-        shades: Iterable[Floats | None] = [None] * len(counts.data)
+        shades: Iterable[Float32Array | None] = [None] * len(counts.data)
         if self.vignetting is not None:
             shades = self.like(self.vignetting, counts.data, "vignetting")
         rows = zip(counts.data, counts.valid, shades, strict=True)
@@ -238,13 +237,13 @@ class Counts(NamedTuple):
     A row is a channel; under patterns a frame of one.
     """
 
-    data: Floats
-    valid: npt.NDArray[np.bool_]
+    data: Float32Array
+    valid: BoolArray
     warnings: tuple[str, ...]
 
 
 def channel_noise(
-    data: Floats, valid: npt.NDArray[np.bool_], noise: Noise, shade: Floats | None = None
+    data: Float32Array, valid: BoolArray, noise: Noise, shade: Float32Array | None = None
 ) -> float:
     """Return one channel's noise deviation in counts, at least what float32 can tell.
 
@@ -265,7 +264,7 @@ def channel_noise(
     return max(deviation, LEAST_NOISE * size) or 1.0
 
 
-def _clipped(data: Floats, valid: npt.NDArray[np.bool_]) -> npt.NDArray[np.bool_]:
+def _clipped(data: Float32Array, valid: BoolArray) -> BoolArray:
     """Return which pixels are at full scale, as are all around them: such have no noise."""
     from scipy.ndimage import minimum_filter
 
@@ -326,7 +325,7 @@ def central(calibration: Calibration) -> Calibration:
     return replace(nearest, psfs=one_psf(calibration)[None])
 
 
-def _frames(frames: npt.ArrayLike, light: Floats) -> Floats:
+def _frames(frames: npt.ArrayLike, light: Float32Array) -> Float32Array:
     """Return frames that fit their patterns, each channel's in turn."""
     data = real_array(plain_array(frames), "The measurement")
     if data.ndim not in (3, 4) or data.shape[:3] != light.shape:

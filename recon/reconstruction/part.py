@@ -7,11 +7,11 @@ from operator import add
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
+from recon.arrays import Array, BoolArray
 from recon.base import fft
 from recon.base.namespace import array_namespace
-from recon.camera.base import Array, LinearOperator
+from recon.camera.base import LinearOperator
 from recon.camera.camera_model import CAMERAS, LOW_RANK_ERROR
 from recon.camera.convolution import Convolution, field_of
 from recon.camera.factors import BackgroundRemoval, Erasures, PatternedCamera
@@ -93,7 +93,7 @@ class Part:
         self.tau: float | None = None
         self.weight, self.held = 0.0, 1.0
         self._removed: BackgroundRemoval | None = None
-        self._support: npt.NDArray[np.bool_] | None = None
+        self._support: BoolArray | None = None
         self._usual: Array = np.zeros((1, 1, 1), self.dtype)
         self.removal = (
             BackgroundRemoval(self.valid.shape, BACKGROUND_FREQUENCIES, self.valid, self.dtype)

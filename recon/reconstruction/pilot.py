@@ -8,16 +8,12 @@ from dataclasses import dataclass, replace
 from typing import Any, Self
 
 import numpy as np
-import numpy.typing as npt
 
+from recon.arrays import Array, BoolArray, Float64Array
 from recon.reconstruction.part import Part
 from recon.reconstruction.problem import Problem
 from recon.reconstruction.solvers import SOLVERS
 from recon.solvers.base import IterationRecord, Outcome, Solver, StoppingRules
-
-Array = npt.NDArray[Any]
-Floats = npt.NDArray[np.float64]
-Bools = npt.NDArray[np.bool_]
 
 FINE_PX = 3.0
 """Deviation of the Gaussian whose mean is taken off what is left, pixels: slow waves are left by unfinished
@@ -185,7 +181,7 @@ def _said(part: Part, iterate: Array) -> tuple[Array, Array | None, Array]:
     return solution, background, left
 
 
-def fine_structure(rest: Array, known: Bools) -> Array:
+def fine_structure(rest: Array, known: BoolArray) -> Array:
     """Return what is left less its own local mean, (height, width); 0 where nothing is known."""
     from scipy.ndimage import gaussian_filter
 
@@ -194,10 +190,10 @@ def fine_structure(rest: Array, known: Bools) -> Array:
     return np.where(known, rest - local, 0)
 
 
-def tile_means(image: Array, where: Bools) -> Floats:
+def tile_means(image: Array, where: BoolArray) -> Float64Array:
     """Return the mean over the chosen pixels of each tile that has any."""
     rows, columns = (np.arange(n) * TILES // n for n in image.shape)
     tile = (rows[:, None] * TILES + columns)[where]
     count, total = np.bincount(tile), np.bincount(tile, image[where])
-    means: Floats = total[count > 0] / count[count > 0]
+    means: Float64Array = total[count > 0] / count[count > 0]
     return means

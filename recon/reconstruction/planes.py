@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from recon.analysis.correlation import similarity
+from recon.arrays import Array, BoolArray, Float64Array
 from recon.camera.camera_model import Depths, members_of_depths
 from recon.camera.refocus import refocus
 from recon.camera.refocus_field import refocus_field
@@ -21,8 +21,6 @@ from recon.reconstruction.options import Overrides
 from recon.reconstruction.part import Part
 from recon.reconstruction.probe import CoarsePass
 from recon.types import Calibration
-
-Array = npt.NDArray[Any]
 
 LEFT_OUT = 0.02
 """Share of the coarse pass's light, of any channel, that all planes together that are left out may hold."""
@@ -116,7 +114,7 @@ def _within(asked: tuple[int, ...], n: int) -> tuple[int, ...]:
     return asked
 
 
-def _most_of(light: npt.NDArray[np.float64]) -> npt.NDArray[np.bool_]:
+def _most_of(light: Float64Array) -> BoolArray:
     """Return the fewest planes that hold all but ``LEFT_OUT`` of the light; all where there is none."""
     if not light.any():
         return np.ones(len(light), bool)
@@ -127,7 +125,7 @@ def _most_of(light: npt.NDArray[np.float64]) -> npt.NDArray[np.bool_]:
     return chosen
 
 
-def _share(light: npt.NDArray[np.float64], planes: npt.NDArray[np.bool_]) -> float:
+def _share(light: Float64Array, planes: BoolArray) -> float:
     """Largest share of any channel's light in some planes."""
     return float(light[:, planes].sum(axis=1).max())
 
@@ -290,7 +288,7 @@ def _spread(psf: Array) -> float:
 
 def signs_of_light(
     residual: Array, left_out: Calibration, channel: int, window: tuple[int, int] | None
-) -> npt.NDArray[np.float64]:
+) -> Float64Array:
     """Return the largest correlation of a residual with every left-out plane's unit-energy central PSF.
 
     Parameters

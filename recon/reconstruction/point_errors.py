@@ -12,12 +12,12 @@ import threading
 from collections.abc import Callable
 from contextlib import closing
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from recon.analysis.point_places import PointPlaces, voxels_of
+from recon.arrays import Float64Array
 from recon.camera.grid import Grid
 from recon.camera.point_fit import HELD, believed, misfit
 from recon.camera.points import FieldFunctions, PointImages, Points, points_on_grid
@@ -30,9 +30,6 @@ from recon.reconstruction.problem import Problem
 from recon.reconstruction.result import Reconstruction
 from recon.reconstruction.weights import is_weighted, kind_of
 from recon.types import Calibration
-
-Array = npt.NDArray[Any]
-Floats = npt.NDArray[np.float64]
 
 COORDINATES = 4
 """Of a point: plane, row, column and light."""
@@ -59,9 +56,9 @@ class PointErrors:
         Of row, column and light.
     """
 
-    places: Floats
-    light: Floats
-    covariance: Floats
+    places: Float64Array
+    light: Float64Array
+    covariance: Float64Array
 
     @property
     def words(self) -> str:
@@ -74,7 +71,7 @@ class PointErrors:
         return f"{len(self.light)}, placed to {place:.2g} pixels, light to {light:.1%} (medians)"
 
     @property
-    def deviations(self) -> Floats:
+    def deviations(self) -> Float64Array:
         """Standard deviations of row, column and light, (n, 3)."""
         return np.sqrt(np.diagonal(self.covariance, axis1=1, axis2=2))
 

@@ -4,19 +4,16 @@ from __future__ import annotations
 
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from recon.analysis.correlation import autocorrelate
+from recon.arrays import Array, Float64Array
 from recon.camera.camera_model import Depths, ModelName
 from recon.camera.spatially_varying import SpatiallyVarying
 from recon.reconstruction.part import Part
 from recon.reconstruction.pilot import Begun, held_out, pilot
 from recon.reconstruction.problem import Problem
-
-Array = npt.NDArray[Any]
 
 COARSE_PX = 96
 """Longest side that the coarse pass works on, pixels, about. Depths are told apart by a pixel's shift at the
@@ -43,7 +40,7 @@ class CoarsePass:
         Mean of the smooth background relative to that of the data.
     """
 
-    light: npt.NDArray[np.float64]
+    light: Float64Array
     smooth_share: float
 
 
@@ -60,7 +57,7 @@ def coarse_copy(problem: Problem, model: ModelName, prior: str, *, background: b
     return replace(problem, options=options, model=model, smooth=background)
 
 
-def _coarse_pass(problem: Problem) -> tuple[npt.NDArray[np.float64], float]:
+def _coarse_pass(problem: Problem) -> tuple[Float64Array, float]:
     """Return the planes' shares of the light of a problem of one channel, and the background's."""
     found = pilot(problem, COARSE_ITERATIONS)
     assert found.background is not None
@@ -139,7 +136,7 @@ def resolution_px(psf: Array) -> float:
 
 def psf_window(depths: Depths) -> tuple[int, int]:
     """Height and width of the central window that holds the light of all PSFs."""
-    light: npt.NDArray[Any] = np.zeros(depths.central.shape[2:])
+    light: Array = np.zeros(depths.central.shape[2:])
     for field in depths.fields:
         light = np.maximum(light, field.psfs.max(axis=(0, 1)))
     light = np.where(light > 0.02 * light.max(), light, 0)

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 
+from recon.arrays import Array, BoolArray, Float32Array
 from recon.base.blocks import block_mean
 from recon.base.checks import as_channels, check_psf
 from recon.base.declare import settled
@@ -20,7 +21,6 @@ from recon.errors import InputError
 from recon.priors import PRIORS, Prior, TotalVariation
 from recon.reconstruction.measurement import (
     LINES_FOUND,
-    Floats,
     Measurement,
     OfOnePhotograph,
     depths_of,
@@ -37,7 +37,6 @@ if TYPE_CHECKING:
     from recon.reconstruction.choice import Choice
     from recon.reconstruction.reduction import Reduction
 
-Array = npt.NDArray[Any]
 Stage = Callable[[float, str], object]
 """``on_stage(share, what)``: how much is done, 0 to 1, of what comes before or after the iterations."""
 
@@ -86,9 +85,9 @@ class Problem:
     measurement: Measurement
     calibration: Calibration
     options: ReconstructionOptions
-    data: Floats
-    valid: npt.NDArray[np.bool_]
-    noise: Floats
+    data: Float32Array
+    valid: BoolArray
+    noise: Float32Array
     depths: Depths
     model: ModelName
     reason: str
@@ -241,7 +240,7 @@ class Problem:
         frames = self.measurement.frames
         return slice(channels.start * frames, channels.stop * frames)
 
-    def as_measured(self, rows: Array) -> Floats:
+    def as_measured(self, rows: Array) -> Float32Array:
         """Return rows of data, (n, height, width), in the measurement's shape, or with its channels."""
         frames, *pixels = self.measurement.frames, *rows.shape[1:]
         channels = rows.astype(np.float32).reshape(-1, frames, *pixels) if self.patterned else rows
@@ -325,13 +324,13 @@ class Problem:
         return np.asarray([float(np.sqrt(np.mean(energies(psfs))))])
 
     @property
-    def image_scale(self) -> Floats:
+    def image_scale(self) -> Float32Array:
         """From the scaled problem's object to measurement units, (n_channels, 1, 1, 1)."""
         noise = self.noise[:: self.measurement.frames]
         return np.asarray(noise / self.energy, np.float32)[:, None, None, None]
 
     @cached_property
-    def levelled(self) -> tuple[Depths, Floats]:
+    def levelled(self) -> tuple[Depths, Float32Array]:
         """PSFs as the prior counts light, and the gains, on the whole field, that bring a solution back.
 
         l1 counts light on the sensor: no voxel may be the cheaper explanation.
@@ -341,7 +340,7 @@ class Problem:
         return levelled(self.depths, self.sensor_shape, varying=self.varies)
 
     @property
-    def gains(self) -> Floats:
+    def gains(self) -> Float32Array:
         """Gains of the voxels that are returned."""
         gains = self.levelled[1]
         rows, columns = self.window
@@ -410,7 +409,7 @@ class Problem:
         if not (np.isfinite(weights).all() and (weights >= 0).all()):
             raise InputError(f"axis_weights must be 0 or more, and finite; found {given!r}.")
 
-    def measured(self, solution: Array, channels: slice) -> Floats:
+    def measured(self, solution: Array, channels: slice) -> Float32Array:
         """Return what a solution (some channels, n_z, ...) is in the window, in measurement units.
 
         (n_z, height, width) of one channel, with the channels last where there are several.
@@ -421,7 +420,7 @@ class Problem:
         )
         return np.ascontiguousarray(volumes[0] if len(volumes) == 1 else np.moveaxis(volumes, 0, -1))
 
-    def whole(self, volumes: list[Floats]) -> Floats:
+    def whole(self, volumes: list[Float32Array]) -> Float32Array:
         """Return what the parts' volumes are together, channels last as the measurement has them."""
         volume = volumes[0] if len(volumes) == 1 else np.stack(volumes, axis=-1)
         if not self.flat and self.n_channels == 1:
@@ -456,7 +455,7 @@ class Problem:
         return self.measurement if self.reduction is None else self.reduction.given.measurement
 
     @property
-    def shade(self) -> Floats | None:
+    def shade(self) -> Float32Array | None:
         """Relative light on the data's pixels that they were divided by, (n_channels, height, width)."""
         given = self._given
         if given.vignetting is None or self.patterned:

@@ -28,8 +28,8 @@ from itertools import combinations_with_replacement, product
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
+from recon.arrays import Array, BoolArray, Float64Array
 from recon.base.blocks import block_sum
 from recon.base.declare import settled
 from recon.camera.camera_model import CAMERAS, Depths, choose_model, one_depth
@@ -45,9 +45,6 @@ from recon.reconstruction.problem import Problem, Stage
 from recon.reconstruction.reduction import reduced_calibration
 from recon.reconstruction.weights import kind_of
 from recon.types import Calibration
-
-Array = npt.NDArray[Any]
-Floats = npt.NDArray[np.float64]
 
 SEARCH_PX, SEARCH_ITERATIONS = 100, 30
 """Longest side, about, and iterations of the reconstructions that a first guess is searched with."""
@@ -307,7 +304,7 @@ def _growth(problem: Problem, z_um: float) -> float:
     return paraxial_scale(float(problem.depths.z_um[0]), z_um, _distance_um(problem))
 
 
-def _depth_um(problem: Problem, place: Floats) -> float | None:
+def _depth_um(problem: Problem, place: Float64Array) -> float | None:
     """Return the depth from which a problem's pattern is so large; None where no other was calibrated."""
     d, stack = _distance_um(problem), problem.stack
     if (
@@ -331,7 +328,7 @@ def _nearer(problem: Problem, z_um: float) -> Problem | None:
     return None if same else replace(other, stack=_stack(problem))
 
 
-def _transformation(place: Floats) -> Transformation:
+def _transformation(place: Float64Array) -> Transformation:
     """Return the transformation of a place: rotation in radians, logarithm of the scale where fitted."""
     scale = float(np.exp(place[1])) if len(place) > 1 else 1.0
     return Transformation(scale=scale, rotation_deg=float(np.rad2deg(place[0])))
@@ -371,18 +368,18 @@ class _Trials:
         self._data = image / self._problem.noise[0]
         self._known = known
         self._iterations = iterations if self._problem.is_plain else iterations // LARGE
-        self._done: dict[tuple[float, ...], tuple[Floats, Floats]] = {}
+        self._done: dict[tuple[float, ...], tuple[Float64Array, Float64Array]] = {}
         self.radius_px = _radius_px(self._problem.depths.central)
 
-    def fitted(self, place: Floats) -> Floats:
+    def fitted(self, place: Float64Array) -> Float64Array:
         """Return the mean square of what is left on the fit's pixels, one a tile."""
         return self._at(place)[0]
 
-    def judged(self, place: Floats) -> Floats:
+    def judged(self, place: Float64Array) -> Float64Array:
         """Return the same on the pixels that no fit has seen."""
         return self._at(place)[1]
 
-    def _at(self, place: Floats) -> tuple[Floats, Floats]:
+    def _at(self, place: Float64Array) -> tuple[Float64Array, Float64Array]:
         key = tuple(np.round(place, 9))
         if key not in self._done:
             square = self._left(_transformation(place)) ** 2
@@ -397,7 +394,7 @@ class _Trials:
         return fine_structure(left, self._known)
 
 
-def _binned(image: Array, valid: Array, factor: int) -> tuple[Array, npt.NDArray[np.bool_]]:
+def _binned(image: Array, valid: Array, factor: int) -> tuple[Array, BoolArray]:
     """Average what is known of each block of pixels; return it, and where anything is."""
     known = block_sum(valid.astype(np.float32), factor, about_axis=True)
     light = block_sum(np.where(valid, image, 0), factor, about_axis=True)
@@ -423,7 +420,7 @@ def _copied(depths: Depths, how: Transformation) -> Depths:
     return replace(depths, central=transformed(depths.central, how), fields=fields)
 
 
-def _searched(trials: _Trials, count: Callable[[float], object]) -> Floats:
+def _searched(trials: _Trials, count: Callable[[float], object]) -> Float64Array:
     """Return the best place of a lattice that its neighbours lead to, from none."""
     step = SEARCH_STEP_PX / trials.radius_px
     reach = max(int(LARGEST / step), 1)
@@ -444,15 +441,15 @@ def _searched(trials: _Trials, count: Callable[[float], object]) -> Floats:
 class _Fit:
     """Where a paraboloid through trials is least, and how sure the place is."""
 
-    place: Floats
-    covariance: Floats
+    place: Float64Array
+    covariance: Float64Array
 
 
 MOVES = 3
 """Times that the trials are centred anew where the least lies beyond them."""
 
 
-def _fitted(trials: _Trials, centre: Floats, step: float, count: Callable[[float], object]) -> _Fit:
+def _fitted(trials: _Trials, centre: Float64Array, step: float, count: Callable[[float], object]) -> _Fit:
     """Fit a paraboloid to trials about a place.
 
     Every tile has its own, and the scatter of their slopes at the least tells how sure it is (a sandwich

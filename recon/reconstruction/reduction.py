@@ -4,11 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
+from recon.arrays import Array, Float32Array
 from recon.base.blocks import block_mean, enlarged
 from recon.base.declare import record
 from recon.base.noise import averaged_noise
@@ -22,9 +21,6 @@ from recon.reconstruction.planes import BEYOND, put_back, with_planes_between, w
 from recon.reconstruction.problem import Problem
 from recon.reconstruction.result import Reconstruction
 from recon.types import Calibration
-
-Array = npt.NDArray[Any]
-Floats = npt.NDArray[np.float32]
 
 MORE_ROUNDS = 2
 """Rounds with planes put back, at most: the last of them has all."""
@@ -46,7 +42,7 @@ class Reduction:
     choice: Choice
     tint: Colours | None
 
-    def picture(self, image: Array) -> Floats:
+    def picture(self, image: Array) -> Float32Array:
         """Bring a plane (height, width[, n_channels]) back."""
         image = self._larger(image)
         return np.ascontiguousarray(image if self.tint is None else self.tint.spread(image))
@@ -56,7 +52,7 @@ class Reduction:
         factor, shape = self.choice.binning, self.given.sensor_shape
         return image if factor == 1 else _channels_first(image, 2, lambda c: enlarged(c, factor, shape))
 
-    def volume(self, planes: Array) -> Floats:
+    def volume(self, planes: Array) -> Float32Array:
         """Bring a volume (n_z, height, width[, n_channels]) back; depths that were left out are empty.
 
         Planes beyond the farthest depth, which are the last, are not part of it.
@@ -73,9 +69,9 @@ class Reduction:
                 whole[below : below + 2] += picture / 2
         return whole
 
-    def background(self, image: Array) -> Floats:
+    def background(self, image: Array) -> Float32Array:
         """Bring a background (height, width[, n_channels]) back: counts a pixel, not light to be shared."""
-        larger: Floats = self._larger(image) * self.choice.binning**2
+        larger: Float32Array = self._larger(image) * self.choice.binning**2
         return larger if self.tint is None else larger[..., None] * self.tint.scene.astype(np.float32)
 
     def with_planes(self, result: Reconstruction, rounds: int) -> Problem | None:
@@ -205,7 +201,7 @@ def reduced(choice: Choice, problem: Problem) -> Problem:
     )
 
 
-def on_blocks(data: Floats, valid: Array, noise: Noise, factor: int, *, flat: bool) -> Measurement:
+def on_blocks(data: Float32Array, valid: Array, noise: Noise, factor: int, *, flat: bool) -> Measurement:
     """Return a measurement on blocks of pixels: erased where one of a block's pixels is.
 
     Parameters

@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
-import numpy.typing as npt
 
+from recon.arrays import Array
 from recon.reconstruction.pilot import MODEL_ERROR
 from recon.reconstruction.problem import Problem
 from recon.solvers.base import Outcome, StopReason
@@ -26,7 +24,7 @@ NEGATIVE = 0.25
 
 
 def background_in_words(
-    problem: Problem, background: npt.NDArray[Any] | None, channels: slice = slice(None)
+    problem: Problem, background: Array | None, channels: slice = slice(None)
 ) -> list[str]:
     """Return a warning where a background (shaped as the channels' data, units of the noise) is no light."""
     if background is None:
@@ -41,13 +39,13 @@ def background_in_words(
     ]
 
 
-def _share(problem: Problem, light: npt.NDArray[Any], channels: slice) -> float:
+def _share(problem: Problem, light: Array, channels: slice) -> float:
     """Return some light's mean relative to that of the data of its channels."""
     mean = float(problem.data[channels][problem.valid[channels]].mean())
     return float(light.mean()) / max(abs(mean), 1e-30)
 
 
-def beyond_in_words(problem: Problem, beyond: npt.NDArray[Any], channels: slice = slice(None)) -> list[str]:
+def beyond_in_words(problem: Problem, beyond: Array, channels: slice = slice(None)) -> list[str]:
     """Say how much of the light was taken for light from beyond the depths (shaped as the channels' data)."""
     share = _share(problem, beyond, channels)
     return [

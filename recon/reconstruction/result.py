@@ -7,8 +7,8 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import numpy.typing as npt
 
+from recon.arrays import Array, Float32Array
 from recon.camera.convolution import field_of
 from recon.camera.grid import Grid
 from recon.reconstruction.options import Field
@@ -94,7 +94,7 @@ class Reconstruction:
         :func:`~recon.reconstruction.reconstruct.judged` takes the verdict.
     """
 
-    volume: npt.NDArray[np.float32]
+    volume: Float32Array
     grid: Grid
     model: str
     reason: str
@@ -106,15 +106,15 @@ class Reconstruction:
     histories: tuple[tuple[IterationRecord, ...], ...]
     stop_reasons: tuple[StopReason, ...]
     seconds: float
-    background: npt.NDArray[np.float32] | None = None
+    background: Float32Array | None = None
     empty_planes: tuple[EmptyPlanes, ...] = ()
     warnings: tuple[str, ...] = ()
     verdict: Verdict | None = None
     uncertainty: Uncertainty | None = None
-    residual: npt.NDArray[np.float32] | None = None
+    residual: Float32Array | None = None
     choice: Choice | None = None
     refinement: Refinement | None = None
-    state: npt.NDArray[Any] | None = None
+    state: Array | None = None
     provenance: Mapping[str, Any] = field(default_factory=dict)
     basis: tuple[Problem, Reconstruction] | None = field(default=None, repr=False, compare=False)
 
@@ -134,7 +134,7 @@ class Reconstruction:
         return len(self.volume) == 1
 
     @property
-    def image(self) -> npt.NDArray[np.float32]:
+    def image(self) -> Float32Array:
         """The picture, (height, width[, n_channels]).
 
         Raises ValueError when there are several planes.

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 import numpy as np
-import numpy.typing as npt
 
+from recon.arrays import BoolArray
 from recon.base.blocks import whole_blocks
 from recon.camera.camera_model import (
     CAMERAS,
@@ -20,14 +20,7 @@ from recon.camera.camera_model import (
 from recon.camera.varying_psfs import principal_psfs
 from recon.reconstruction.choice import Decision
 from recon.reconstruction.options import Overrides
-from recon.reconstruction.probe import (
-    ACCEPTED,
-    MARGIN,
-    Within,
-    acceptance_px,
-    psf_window,
-    resolution_px,
-)
+from recon.reconstruction.probe import ACCEPTED, MARGIN, Within, acceptance_px, psf_window, resolution_px
 from recon.verdict.cases import shipped_maps
 from recon.verdict.map import PRECISION
 
@@ -107,7 +100,7 @@ SAMPLES = 7.0
 dB: priors bring back more than the PSF's width says."""
 
 
-def binning_of(depths: Depths, overrides: Overrides, valid: npt.NDArray[np.bool_]) -> Decision:
+def binning_of(depths: Depths, overrides: Overrides, valid: BoolArray) -> Decision:
     """Decide how many pixels are averaged; ``valid``, (n_channels, height, width): which are not erased."""
     sharpest = min(resolution_px(p) for psfs in depths.central for p in psfs)
     side = max(depths.central.shape[2:])

@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import time
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
+from recon.arrays import Array
 from recon.base.blocks import whole_blocks
 from recon.base.shared_lines import shared_lines
 from recon.camera.camera_model import CAMERAS, Extent, ModelName
@@ -48,8 +47,6 @@ from recon.reconstruction.rules import (
 from recon.reconstruction.solvers import SOLVERS, require_solver, volume_priors
 from recon.reconstruction.weights import kind_of
 from recon.types import Calibration
-
-Array = npt.NDArray[Any]
 
 
 def choose(

@@ -8,8 +8,8 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
+from recon.arrays import Array, Float32Array, Float64Array
 from recon.base.declare import settled
 from recon.errors import InputError
 from recon.reconstruction.first_look import FirstLook, look_at
@@ -27,8 +27,7 @@ from recon.solvers import Outcome, Solver, StoppingRules, StopReason
 from recon.solvers.base import Callback, IterationRecord, Keeper
 from recon.solvers.douglas_rachford import DouglasRachford, EmptyPlanes
 
-Array = npt.NDArray[Any]
-Progress = Callable[[IterationRecord, Callable[[], npt.NDArray[np.float32]]], object]
+Progress = Callable[[IterationRecord, Callable[[], Float32Array]], object]
 """``on_progress(record, volume)`` after each iteration; ``volume()`` makes the present one, (n_z, height,
 width[, n_channels]), of one channel where channels are solved one after the other. It may be called until
 ``on_progress`` returns."""
@@ -125,13 +124,13 @@ def _objective(result: Reconstruction) -> float:
 class _Solved:
     """What the run of one part gave."""
 
-    volume: npt.NDArray[np.float32]
+    volume: Float32Array
     state: Array | None
     background: Array | None
     outcome: Outcome
     tau: float | None
     empty: EmptyPlanes
-    signs: npt.NDArray[np.float64] | None
+    signs: Float64Array | None
     memory: str | None
     noise_norm: float
     residual: float
@@ -364,7 +363,7 @@ def _uncertified(empty: tuple[EmptyPlanes, ...]) -> list[str]:
     ]
 
 
-def _stacked(images: list[Array], problem: Problem) -> npt.NDArray[np.float32] | None:
+def _stacked(images: list[Array], problem: Problem) -> Float32Array | None:
     """Return channels (some, height, width) in the measurement's shape."""
     return problem.as_measured(np.concatenate(images)) if images else None
 

@@ -13,8 +13,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from recon.arrays import Array
 from recon.base.registry import Registry
-from recon.camera.base import Array, LinearOperator
+from recon.camera.base import LinearOperator
 from recon.camera.camera_model import CAMERAS
 from recon.errors import InputError
 from recon.priors import PRIORS, Prior, Sum

@@ -22,12 +22,11 @@ from contextlib import closing
 from dataclasses import dataclass, replace
 from functools import cached_property
 from statistics import NormalDist
-from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from recon.analysis.resolution import lateral_resolution
+from recon.arrays import Array, Float32Array
 from recon.base.blocks import block_mean
 from recon.base.declare import settled
 from recon.errors import InputError
@@ -36,9 +35,6 @@ from recon.reconstruction.point_errors import PointErrors, points_of, points_pro
 from recon.reconstruction.problem import Problem, Stage
 from recon.reconstruction.result import Reconstruction
 from recon.reconstruction.solve import solve
-
-Array = npt.NDArray[Any]
-Floats = npt.NDArray[np.float32]
 
 REPEATS = 6
 """Each has a place of the picture four times or more."""
@@ -88,7 +84,7 @@ class Uncertainty:
         Whether the verdict found that the calibration does not fit the photograph.
     """
 
-    deviation: Floats
+    deviation: Float32Array
     repeats: int
     misfit: float
     seconds: float
@@ -137,7 +133,7 @@ class Uncertainty:
             )
         return tuple(f"The deviations are not to be trusted: {why}." for why in said)
 
-    def interval(self, volume: Array, level: float = 0.95) -> tuple[Floats, Floats]:
+    def interval(self, volume: Array, level: float = 0.95) -> tuple[Float32Array, Float32Array]:
         """Return the lower and upper ends, shaped as the volume, that hold the truth with some probability.
 
         Raises InputError when ``level`` is no probability.
@@ -297,7 +293,7 @@ class Replicas:
         error = np.asarray(found, np.float64) - truth
         return _channels_last(mosaic.gathered(_channels_first(error**2)), error)
 
-    def deviation(self, squared_error: Array) -> Floats:
+    def deviation(self, squared_error: Array) -> Float32Array:
         """Return standard deviations from a mean squared error, smooth, and as the spectrum has it."""
         variance = smoothed(squared_error)
         channels = np.maximum(_channels_first(variance).mean(axis=(1, 2)), np.finfo(float).tiny)
@@ -327,7 +323,7 @@ class Replicas:
         both = zip(self._problem.data, self._explained, strict=True)
         return [_power_ratio(_rings(data * taper), _rings(fit * taper)) for data, fit in both]
 
-    def _photograph(self, scene: Array, rng: np.random.Generator) -> Floats:
+    def _photograph(self, scene: Array, rng: np.random.Generator) -> Float32Array:
         """Return data of a scene in the window; what lies beyond it stays as it was found."""
         like = replace(self._result, volume=scene.astype(np.float32), state=None)
         rows, columns = self._problem.window
@@ -432,7 +428,7 @@ class Mosaic:
             for j in range(self.times)
         ]
 
-    def laid(self, picture: Array) -> Floats:
+    def laid(self, picture: Array) -> Float32Array:
         """Return the mosaic of a picture (n, height, width); a rest of a row or column stays dark."""
         moved = np.roll(picture, (-self.first[0], -self.first[1]), axis=(1, 2))
         small = block_mean(moved, self.times)

@@ -19,10 +19,11 @@ from typing import Any, ClassVar
 
 import numpy as np
 
+from recon.arrays import Array
 from recon.base import fft
 from recon.base.arguments import require_argument
 from recon.base.threads import over_rows
-from recon.camera.base import Array, LinearOperator
+from recon.camera.base import LinearOperator
 from recon.camera.convolution import Convolution
 from recon.priors.base import Prior
 from recon.priors.total_variation import TotalVariation

@@ -14,6 +14,7 @@ from typing import Any, ClassVar, Protocol
 import numpy as np
 import numpy.typing as npt
 
+from recon.arrays import Array
 from recon.base.arguments import require_argument, require_numbers
 from recon.base.brief import brief
 from recon.base.namespace import Namespace, namespace_of, to_host
@@ -135,7 +136,6 @@ class StopCheck:
         return None
 
 
-Array = npt.NDArray[Any]
 Callback = Callable[["Solver", IterationRecord], object]
 
 

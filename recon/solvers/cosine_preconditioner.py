@@ -12,9 +12,9 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
+from recon.arrays import Array
 from recon.base import fft
 from recon.base.namespace import Namespace, to_host
-from recon.camera.base import Array
 
 EXACT_MODES = 18
 """Lowest cosine modes per axis that are inverted together: their matrix has 324 rows."""

@@ -26,10 +26,10 @@ from typing import Any, ClassVar
 import numpy as np
 import numpy.typing as npt
 
+from recon.arrays import Array, BoolArray, Float64Array
 from recon.base import fft
 from recon.base.namespace import require_memory, to_host
 from recon.base.threads import in_blocks
-from recon.camera.base import Array
 from recon.camera.convolution import Convolution, PlaneGroups
 from recon.errors import StructureError
 from recon.priors.base import Prior, Separable
@@ -87,11 +87,11 @@ class PlaneWatch:
         self.empty_for = np.zeros(n_z, np.int64)
         self.patience = np.full(n_z, PATIENCE)
 
-    def note(self, light: npt.NDArray[np.float64]) -> None:
+    def note(self, light: Float64Array) -> None:
         """Take down each plane's sum of magnitudes after an iteration."""
         self.empty_for = np.where(light > 0, 0, self.empty_for + 1)
 
-    def due(self) -> npt.NDArray[np.bool_]:
+    def due(self) -> BoolArray:
         """Return which active planes may be left out, at least one plane staying in."""
         due = self.active & (self.empty_for >= self.patience)
         if due.sum() == self.active.sum():

@@ -6,8 +6,9 @@ from typing import ClassVar, Literal
 
 import numpy as np
 
+from recon.arrays import Array
 from recon.base.arguments import require_argument
-from recon.camera.base import Array, LinearOperator
+from recon.camera.base import LinearOperator
 from recon.priors.base import Prior
 from recon.solvers.base import IterationRecord, Solver, require_parts, starting_point
 

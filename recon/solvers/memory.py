@@ -12,11 +12,11 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
+from recon.arrays import Array
 from recon.base.threads import get_threads
 from recon.camera.convolution import GROUPS
 from recon.errors import InputError, NoMemoryError
@@ -298,9 +298,7 @@ class Storage:
 
         return give_up
 
-    def zeros(
-        self, shape: tuple[int, ...], dtype: npt.DTypeLike, *, lasting: bool = False
-    ) -> npt.NDArray[Any]:
+    def zeros(self, shape: tuple[int, ...], dtype: npt.DTypeLike, *, lasting: bool = False) -> Array:
         """Return an array of zeros; a lasting one outlives its :meth:`turn`.
 
         Raises InputError when the scratch folder's disk has no room for it.

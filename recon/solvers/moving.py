@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
+from recon.arrays import Array
 from recon.base import fft
 from recon.base.namespace import namespace_of
 from recon.base.threads import over_rows
-from recon.camera.base import Array
 
 
 def move(images: Array, rows: float, columns: float) -> None:

@@ -21,9 +21,10 @@ from typing import Any, ClassVar
 
 import numpy as np
 
+from recon.arrays import Array
 from recon.base import fft
 from recon.base.namespace import require_memory
-from recon.camera.base import Array, LinearOperator
+from recon.camera.base import LinearOperator
 from recon.camera.convolution import Convolution
 from recon.priors.base import Prior
 from recon.priors.total_variation import TotalVariation

@@ -13,9 +13,10 @@ from typing import Any, ClassVar
 
 import numpy as np
 
+from recon.arrays import Array
 from recon.base.namespace import namespace_of, to_host
 from recon.base.threads import in_blocks
-from recon.camera.base import Array, LinearOperator
+from recon.camera.base import LinearOperator
 from recon.camera.factors import as_cropped_convolution
 from recon.errors import StructureError
 from recon.priors.base import Prior, Separable

@@ -31,10 +31,11 @@ from typing import Any, ClassVar
 
 import numpy as np
 
+from recon.arrays import Array
 from recon.base import fft
 from recon.base.filling import fill_smoothly
 from recon.base.threads import over_rows
-from recon.camera.base import Array, LinearOperator
+from recon.camera.base import LinearOperator
 from recon.camera.convolution import Convolution
 from recon.camera.factors import BackgroundRemoval, Erasures
 from recon.priors.base import Prior

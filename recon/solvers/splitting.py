@@ -13,9 +13,9 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from recon.arrays import Array, BoolArray
 from recon.base import fft
 from recon.base.namespace import Namespace, namespace_of
-from recon.camera.base import Array
 from recon.camera.convolution import Convolution
 from recon.camera.factors import BackgroundRemoval
 from recon.solvers.base import Solver
@@ -292,7 +292,7 @@ class SensorData:
     """
 
     image: Array
-    valid: npt.NDArray[np.bool_] | None = None
+    valid: BoolArray | None = None
     background: BackgroundRemoval | None = None
 
     @classmethod

@@ -9,9 +9,9 @@ from __future__ import annotations
 
 import numpy as np
 
+from recon.arrays import Array
 from recon.base import fft
 from recon.base.threads import get_threads, in_blocks
-from recon.camera.base import Array
 from recon.camera.convolution import Convolution
 from recon.priors.base import Prior
 from recon.solvers.cosine_preconditioner import laplacian_eigenvalues

@@ -26,9 +26,9 @@ from typing import Any, ClassVar
 
 import numpy as np
 
+from recon.arrays import Array
 from recon.base import fft
 from recon.base.namespace import require_memory, to_host
-from recon.camera.base import Array
 from recon.camera.convolution import Convolution
 from recon.priors.base import Prior, Separable
 from recon.priors.total_variation import TotalVariation

@@ -6,9 +6,10 @@ import time
 
 import numpy as np
 
+from recon.arrays import Array
 from recon.base import fft
 from recon.base.filling import fill_smoothly
-from recon.camera.base import Array, LinearOperator
+from recon.camera.base import LinearOperator
 from recon.camera.factors import CroppedConvolution, as_cropped_convolution
 from recon.solvers.base import Outcome, StopReason
 from recon.solvers.cosine_preconditioner import laplacian_eigenvalues

@@ -2,15 +2,10 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
-import numpy.typing as npt
 
+from recon.arrays import Array, Float32Array, Float64Array
 from recon.errors import InputError
-
-Array = npt.NDArray[Any]
-Floats = npt.NDArray[np.float32]
 
 PERCENTILE = 20.0
 """Of a pixel's values that its baseline is (Kuo 2020, Fig. 6.5)."""
@@ -27,7 +22,7 @@ MOST_COMPARED = 500
 _ANCHORS_A_WINDOW = 4
 
 
-def fading(frames: Floats) -> npt.NDArray[np.float64]:
+def fading(frames: Float32Array) -> Float64Array:
     """Return how the whole field's light fades, relative to the first frame, (n_frames,): an exponential.
 
     Its rate is the median slope of the logarithm of a frame's light between any two frames (Sen 1968):
@@ -48,16 +43,16 @@ def fading(frames: Floats) -> npt.NDArray[np.float64]:
     level = np.log(light[at])
     slope = float(np.median((level[later] - level[first]) / (at[later] - at[first])))
     error = float(np.std(level - slope * at) / (np.sqrt(len(at)) * at.std()))
-    relative: npt.NDArray[np.float64] = np.exp(slope * (abs(slope) > SURE * error) * np.arange(len(frames)))
+    relative: Float64Array = np.exp(slope * (abs(slope) > SURE * error) * np.arange(len(frames)))
     return relative
 
 
 def baseline(
-    frames: Floats,
+    frames: Float32Array,
     window: int,
     percentile: float = PERCENTILE,
-    fade: npt.NDArray[np.float64] | None = None,
-) -> Floats:
+    fade: Float64Array | None = None,
+) -> Float32Array:
     """Return each pixel's baseline F0: a sliding percentile, (n_frames, height, width), float32.
 
     The percentile is taken in windows centred on frames a quarter of a window apart and drawn linearly
@@ -106,7 +101,7 @@ def baseline(
     return result
 
 
-def smoothed(frames: Floats, deviation_px: float) -> Floats:
+def smoothed(frames: Float32Array, deviation_px: float) -> Float32Array:
     """Return frames (n_frames, height, width) smoothed by a Gaussian, which weighs a cell's light together.
 
     A cell that a reconstruction shows in one or two pixels hops among them as it sways: neighbours do not
@@ -120,14 +115,14 @@ def smoothed(frames: Floats, deviation_px: float) -> Floats:
     return result
 
 
-def brightness(image: Floats) -> float:
+def brightness(image: Float32Array) -> float:
     """Return the value above which half of an image's light lies; empty space around it changes nothing."""
     values = np.sort(np.maximum(image, 0), axis=None)[::-1]
     light = np.cumsum(values, dtype=np.float64)
     return float(values[np.searchsorted(light, light[-1] / 2)])
 
 
-def floor_of(frames: Floats) -> float:
+def floor_of(frames: Float32Array) -> float:
     """Return the least baseline that a change is divided by: a tenth of how bright the pictures' light is.
 
     Raises InputError when the pictures, (n_frames, height, width), hold no light.
@@ -138,7 +133,7 @@ def floor_of(frames: Floats) -> float:
     return floor
 
 
-def change(frames: Floats, base: Floats, floor: float) -> Floats:
+def change(frames: Float32Array, base: Float32Array, floor: float) -> Float32Array:
     """Return dF/F, ``(F - F0) / max(F0, floor)``; the floor keeps what hardly shines from looking active.
 
     Parameters

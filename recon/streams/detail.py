@@ -6,10 +6,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
+from recon.arrays import Float32Array, Float64Array
 from recon.base.blocks import block_mean
-from recon.reconstruction.measurement import Floats
 from recon.streams.pace import HELPED
 
 SENSOR_WORK = 9.0
@@ -17,7 +16,7 @@ SENSOR_WORK = 9.0
 processor milliseconds (two iterations of total variation, 135 x 240 pixels, one thread)."""
 
 
-Depths_um = npt.NDArray[np.float64]
+Depths_um = Float64Array
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,7 +45,7 @@ class Detail:
         return f"{len(self.planes)} of {count} ({', '.join(listed)}{' mm' if known else ''})"
 
 
-def ladder(central: Floats, binnings: Sequence[int], plane: int | None) -> dict[float, Detail]:
+def ladder(central: Float32Array, binnings: Sequence[int], plane: int | None) -> dict[float, Detail]:
     """Return what pictures may hold, by coarseness, from all to least.
 
     Pixels and planes cost different time and lose different things, so that neither goes first as a rule.
@@ -103,12 +102,12 @@ def _spread(n_planes: int, count: int, plane: int | None) -> tuple[int, ...]:
     return tuple(sorted({kept[0], *between, plane, kept[-1]}))
 
 
-def _held_by_pixels(psf: Floats, binning: int) -> float:
+def _held_by_pixels(psf: Float32Array, binning: int) -> float:
     """Return the share of a PSF's contrast (n_channels, height, width) that is left on binned pixels."""
     return float(np.var(block_mean(psf, binning, about_axis=True)) / np.var(psf))
 
 
-def _held_by_planes(central: Floats, planes: Sequence[int]) -> float:
+def _held_by_planes(central: Float32Array, planes: Sequence[int]) -> float:
     """Return the share of the PSFs' contrast that those of the nearest of ``planes`` explain."""
     flat = central.reshape(len(central), -1)
     means, deviations = flat.mean(axis=1), flat.std(axis=1)

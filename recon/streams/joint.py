@@ -13,14 +13,14 @@ from typing import Literal, Protocol
 
 import numpy as np
 
+from recon.arrays import Array, Float32Array
 from recon.base.threads import in_blocks
-from recon.camera.base import Array, LinearOperator
+from recon.camera.base import LinearOperator
 from recon.camera.convolution import Convolution
 from recon.camera.factors import Erasures
 from recon.errors import InputError
 from recon.priors.base import Prior
 from recon.reconstruction.first_look import look_at
-from recon.reconstruction.measurement import Floats
 from recon.reconstruction.part import Part
 from recon.reconstruction.problem import Problem
 from recon.solvers.sensor_admm import SensorAdmm
@@ -194,13 +194,13 @@ def require_joint(problem: Problem) -> None:
 
 def solve_together(
     problem: Problem,
-    frames: Floats,
+    frames: Float32Array,
     over_time: OverTimeName,
     *,
     weight: float | None = None,
     iterations: int = JOINT_ITERATIONS,
     ended: Callable[[], bool] = lambda: False,
-) -> Floats | None:
+) -> Float32Array | None:
     """Reconstruct a block of frames with a prior over time.
 
     Raises InputError when there are fewer than two frames, or as of :func:`require_joint`.

@@ -11,13 +11,14 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from recon.arrays import Array, BoolArray, Float32Array
 from recon.base.blocks import block_mean
 from recon.base.checks import as_channels, require_finite
 from recon.base.declare import inapplicable, with_overrides
 from recon.camera.camera_model import members_of_depths
 from recon.errors import InputError
 from recon.reconstruction.decoys import fitting_depth
-from recon.reconstruction.measurement import Floats, Measurement
+from recon.reconstruction.measurement import Measurement
 from recon.reconstruction.options import ReconstructionOptions
 from recon.reconstruction.problem import Problem
 from recon.reconstruction.reconstruct import given, reconstruct
@@ -40,8 +41,6 @@ from recon.streams.pace import Pace, Spent
 from recon.streams.stillness import SceneState, SceneWatch
 from recon.streams.video import require_steps, stream_problem
 from recon.types import Calibration, real_array
-
-Array = npt.NDArray[Any]
 
 LEAST_SIDE = 16
 """Pixels of a picture's short side below which no binning goes."""
@@ -131,7 +130,7 @@ class LiveReconstructor:
         self._watch = SceneWatch(live.average)
         self._shape: tuple[int, ...] = ()
         self._background: Array | None = None
-        self._valid: npt.NDArray[np.bool_] | None = None
+        self._valid: BoolArray | None = None
         self._scene = SceneState.NEW
         self._follows = False
         """Whether the solver knows the scene as it was a frame ago."""
@@ -274,7 +273,7 @@ class LiveReconstructor:
         options = ReconstructionOptions(prior="tv", model="convolution", drop_empty=False)
         return depths[fitting_depth(Problem.of(measurement, self._given, options), now)]
 
-    def shown(self, volume: Floats, planes: tuple[int, ...] | None = None) -> Floats:
+    def shown(self, volume: Float32Array, planes: tuple[int, ...] | None = None) -> Float32Array:
         """Return the picture of depths (n_z, ...): of the one chosen, else each pixel's brightest.
 
         Parameters
@@ -305,7 +304,7 @@ class LiveReconstructor:
         self._fit = CalibrationWatch(self._given if isinstance(self._given, Calibration) else None)
 
     # Pieces ----------------------------------------------------------------------------------------
-    def _sees_light(self, level: Level, frame: Floats) -> bool:
+    def _sees_light(self, level: Level, frame: Float32Array) -> bool:
         """Tell whether there is a scene to see; what was settled on noise is then made anew."""
         mean = self._as_given(self._watch.mean)
         if not level.sees_light(mean, self._watch.count):
@@ -337,7 +336,7 @@ class LiveReconstructor:
                 self._settled &= level.solver.confirm()
                 return done, _now() - first
 
-    def _level_for(self, frame: Floats) -> Level:
+    def _level_for(self, frame: Float32Array) -> Level:
         """Return the level for the next frame: the one there is, until another is made."""
         if self._level is None:
             try:
@@ -358,7 +357,7 @@ class LiveReconstructor:
             self._make(self._details[wanted], frame)
         return self._level
 
-    def _level_of(self, detail: Detail, frame: Floats) -> Level:
+    def _level_of(self, detail: Detail, frame: Float32Array) -> Level:
         """Return the level of some detail, without a solver, for a frame on the calibration's pixels."""
         binning, planes = detail.binning, detail.planes
         valid = np.broadcast_to(True if self._valid is None else self._valid, frame.shape)
@@ -379,7 +378,7 @@ class LiveReconstructor:
         details = [self._details[c] for c in self._pace.levels]
         return next((d for d in details if self._first_work <= AT_ONCE * d.coarseness**2), details[-1])
 
-    def _make(self, detail: Detail, frame: Floats) -> None:
+    def _make(self, detail: Detail, frame: Float32Array) -> None:
         """Begin to make a level for a frame on the calibration's pixels."""
         kept = frame.copy()
         self._coming = ComingLevel(detail, lambda: self._level_of(detail, kept).solving())
@@ -429,11 +428,11 @@ class LiveReconstructor:
         self._level, self._coming = level, None
         self._follows = self._settled = False
 
-    def _as_given(self, channels: Floats) -> Floats:
+    def _as_given(self, channels: Float32Array) -> Float32Array:
         """Return a frame (n_channels, height, width) with the axes that frames came with."""
         return channels[0] if len(self._shape) == 2 else np.moveaxis(channels, 0, -1)
 
-    def _measured(self, image: Array) -> Floats:
+    def _measured(self, image: Array) -> Float32Array:
         """Return a frame on the calibration's pixels, less background, 0 where erased, channels first."""
         frame = self._on_calibration_pixels(image)
         if image.shape != self._shape:
@@ -452,7 +451,7 @@ class LiveReconstructor:
             frame = frame - self._background
         return frame if self._valid is None else np.where(self._valid, frame, np.float32(0))
 
-    def _on_calibration_pixels(self, image: Array) -> Floats:
+    def _on_calibration_pixels(self, image: Array) -> Float32Array:
         if image.ndim not in (2, 3) or image.dtype.kind not in "uif":
             raise InputError(
                 f"A frame must be (height, width[, n_channels]) of numbers, not {image.dtype} {image.shape}."
@@ -469,7 +468,7 @@ class LiveReconstructor:
             )
         return block_mean(image[None] if image.ndim == 2 else np.moveaxis(image, 2, 0), factor)
 
-    def _picture(self, level: Level, volume: Floats, done: int | None, began: Spent) -> LivePicture:
+    def _picture(self, level: Level, volume: Float32Array, done: int | None, began: Spent) -> LivePicture:
         """Return a picture: of ``done`` iterations, of the filter (0), or of a dark frame (None)."""
         filtered, detail = not done, level.detail
         plane = self._filtered_plane(detail) if filtered else self.live.plane

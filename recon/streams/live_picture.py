@@ -6,14 +6,12 @@ from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor, wait
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
+from recon.arrays import Float32Array
 from recon.base.declare import option, require
 from recon.errors import InputError
-from recon.reconstruction.measurement import Floats
 from recon.reconstruction.options import ReconstructionOptions
 from recon.reconstruction.part import Part
 from recon.reconstruction.problem import Problem
@@ -21,9 +19,6 @@ from recon.solvers.wiener_filter import WienerFilter, cross_validated
 from recon.streams.detail import Detail
 from recon.streams.stillness import SceneState, has_light
 from recon.streams.video import VideoSolver
-
-Array = npt.NDArray[Any]
-
 
 SETTLED = 1e-3
 """Change an iteration below which a frame's picture is done, or the solver's own where that is smaller: 55 dB
@@ -87,7 +82,7 @@ class LiveOptions:
 class LivePicture:
     """A picture, and what it is worth."""
 
-    image: Floats
+    image: Float32Array
     """(height, width) or (height, width, n_channels): the part of the scene opposite to the sensor, on pixels
     binned ``binning x binning``; brightness does not depend on the binning."""
     binning: int
@@ -108,7 +103,7 @@ class LivePicture:
     """Time that the picture took."""
     budget_ms: float
     """Time that it was allowed."""
-    volume: Floats | None = None
+    volume: Float32Array | None = None
     """(n_z, height, width[, n_channels]): the depths ``planes``, where several are reconstructed; None for a
     filter's picture."""
     planes: tuple[int, ...] = (0,)
@@ -168,7 +163,7 @@ class Level:
         wiener = WienerFilter(operator, cross_validated(operator, part.data))
         return cls(problem, detail, whole, part, wiener, has_light(_filled(problem), problem.noise))
 
-    def sees_light(self, frame: Floats, count: int) -> bool:
+    def sees_light(self, frame: Float32Array, count: int) -> bool:
         """Tell whether the mean of ``count`` frames, shaped as those that came, holds more than noise."""
         seen = self.problem.with_data(frame)
         return has_light(_filled(seen), self.problem.noise / np.float32(count) ** 0.5)
@@ -213,20 +208,20 @@ class Level:
         solver.begin()
         return replace(self, solver=solver)
 
-    def filtered(self, frame: Floats) -> Floats:
+    def filtered(self, frame: Float32Array) -> Float32Array:
         """Return Wiener's picture, (1, height, width[, n_channels]), of a frame on binned pixels."""
         plain = self.preview.problem
         light = np.maximum(self.filter(plain.with_data(frame).data), 0)
         volume = plain.measured(self.preview.lifted(light), self.preview.channels)
         return plain.whole([volume]) / np.float32(self.binning**2)
 
-    def solved(self) -> Floats:
+    def solved(self) -> Float32Array:
         """Return what the solver has at present, (n_z, height, width[, n_channels])."""
         assert self.solver is not None
         return self.solver.volume() / np.float32(self.binning**2)
 
 
-def _filled(problem: Problem) -> Floats:
+def _filled(problem: Problem) -> Float32Array:
     """Return a problem's frame in counts, (height, width, n_channels), the mean where pixels are erased."""
     data, valid = problem.data * problem.noise[:, None, None], problem.valid
     if not valid.all():

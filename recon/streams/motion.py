@@ -3,16 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
+from recon.arrays import Array, BoolArray, Float32Array, Float64Array
 from recon.base.blocks import block_mean
 from recon.solvers.moving import move
-
-Array = npt.NDArray[Any]
-Floats = npt.NDArray[np.float32]
 
 LEAST_PX = 0.05
 """A frame that lies off the one before by less is taken for still."""
@@ -41,7 +37,7 @@ class Panning:
         """Take the next frame for the first."""
         self._before = None
 
-    def next(self, frame: Array, valid: npt.NDArray[np.bool_]) -> tuple[float, float]:
+    def next(self, frame: Array, valid: BoolArray) -> tuple[float, float]:
         """Return (rows, columns) by which a frame lies off the one before; zeros where that explains little.
 
         Parameters
@@ -91,7 +87,7 @@ class Panning:
 class Motion:
     """How far each frame lies off the mean of all, less the median frame."""
 
-    shifts: npt.NDArray[np.float64]
+    shifts: Float64Array
     """(n_frames, 2): rows and columns, pixels."""
     largest_px: float
     """Of the frames' distances from their median place."""
@@ -102,7 +98,7 @@ class Motion:
         return self.largest_px < 0.5
 
 
-def motion(frames: Floats) -> Motion:
+def motion(frames: Float32Array) -> Motion:
     """Register each frame to the mean of all, by cross-correlation refined to a fraction of a pixel.
 
     Means are taken off and edges faded out (Hann window); spectra are not whitened, so that what is bright
@@ -120,7 +116,7 @@ def motion(frames: Floats) -> Motion:
     return Motion(shifts, float(np.hypot(*shifts.T).max(initial=0.0)))
 
 
-def aligned(frames: Floats, found: Motion) -> Floats:
+def aligned(frames: Float32Array, found: Motion) -> Float32Array:
     """Return the frames moved back to their median place, cubic splines, float32."""
     from scipy import ndimage
 

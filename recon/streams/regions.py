@@ -20,17 +20,14 @@ from __future__ import annotations
 
 from collections import Counter, deque
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
+from recon.arrays import Array, BoolArray, Float32Array, Float64Array
 from recon.errors import InputError
 from recon.streams.activity import brightness
 from recon.streams.motion import Motion
-
-Array = npt.NDArray[Any]
-Floats = npt.NDArray[np.float32]
 
 LASTING = 0.6
 """Mean squared step from frame to frame relative to the variance (von Neumann's ratio) below which a course
@@ -74,13 +71,15 @@ class Region:
     correlation: float
     """Local correlation at its peak."""
 
-    def trace(self, frames: Floats) -> Floats:
+    def trace(self, frames: Float32Array) -> Float32Array:
         """Return the mean over the region of each frame, (n_frames,)."""
-        trace: Floats = frames[:, self.rows, self.columns].mean(axis=1, dtype=np.float64).astype(np.float32)
+        trace: Float32Array = (
+            frames[:, self.rows, self.columns].mean(axis=1, dtype=np.float64).astype(np.float32)
+        )
         return trace
 
 
-def local_correlation(frames: Floats) -> Floats:
+def local_correlation(frames: Float32Array) -> Float32Array:
     """Return each pixel's mean correlation over time with its eight neighbours, (height, width).
 
     Parameters
@@ -104,7 +103,7 @@ def local_correlation(frames: Floats) -> Floats:
     return (total / np.maximum(count, 1)).astype(np.float32)
 
 
-def _courses(frames: Floats) -> tuple[Floats, Array]:
+def _courses(frames: Float32Array) -> tuple[Float32Array, Array]:
     """Return each pixel's course over time less its mean, and the courses' norms."""
     courses = frames - frames.mean(axis=0)
     return courses, np.sqrt(np.sum(courses.astype(np.float64) ** 2, axis=0))
@@ -118,7 +117,7 @@ class Search:
     """The most correlated first."""
     left_out: dict[str, int]
     """What the other places are, in words, and how many."""
-    correlation: Floats
+    correlation: Float32Array
     """(height, width): of :func:`local_correlation`."""
 
 
@@ -144,7 +143,7 @@ def _own(change: Array) -> Array:
     return np.asarray(change - np.median(change))
 
 
-def noise_of(frames: Floats) -> float:
+def noise_of(frames: Float32Array) -> float:
     """Return the noise of frames, deviation of means of 3 x 3 pixels, where half of the light is.
 
     A prior or a bound at zero hides it where it is dark: a speckle there is noise all the same. Where
@@ -160,7 +159,7 @@ def noise_of(frames: Floats) -> float:
 
     light: Array = np.zeros(frames.shape[1:])
     steps, apart = np.zeros_like(light), np.zeros_like(light)
-    before: deque[Floats] = deque(maxlen=APART)
+    before: deque[Float32Array] = deque(maxlen=APART)
     for frame in frames:
         smooth = uniform_filter(frame, 3)
         if before:
@@ -181,7 +180,7 @@ def noise_of(frames: Floats) -> float:
 
 
 def find_regions(
-    frames: Floats,
+    frames: Float32Array,
     *,
     least_correlation: float = 0.5,
     radius_px: float = 8.0,
@@ -253,7 +252,7 @@ def find_regions(
 class _Around:
     """A candidate's surroundings."""
 
-    courses: Floats
+    courses: Float32Array
     """(n_frames, rows, columns): less their means."""
     norm: Array
     """(rows, columns): of the courses."""
@@ -315,7 +314,7 @@ def _lasting(courses: Array) -> Array:
     return np.maximum(rest, 0)
 
 
-def _explained(course: Array, shifts: npt.NDArray[np.float64]) -> float:
+def _explained(course: Array, shifts: Float64Array) -> float:
     """Return the share of a course's variance that shifts explain, to the second order."""
     down, across = shifts.T
     terms = np.stack([down, across, down**2, across**2, down * across], axis=1)
@@ -324,7 +323,7 @@ def _explained(course: Array, shifts: npt.NDArray[np.float64]) -> float:
     return float(fitted @ fitted) / float(course @ course)
 
 
-def _always_seen(shape: tuple[int, ...], moved: Motion) -> npt.NDArray[np.bool_]:
+def _always_seen(shape: tuple[int, ...], moved: Motion) -> BoolArray:
     """Return which pixels no frame has at a border, or beyond."""
     seen = np.zeros(shape, bool)
     down, across = (int(np.ceil(most)) + 1 for most in np.abs(moved.shifts).max(axis=0))

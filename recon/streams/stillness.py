@@ -9,15 +9,12 @@ moves and grows from there, without a threshold in counts.
 from __future__ import annotations
 
 import enum
-from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
+from recon.arrays import Array
 from recon.base.blocks import block_mean
 from recon.base.noise import estimate_deviation
-
-Array = npt.NDArray[Any]
 
 BLOCKS = (2, 4, 8)
 """Sides of the blocks, pixels, each twice the one before: caustics are about as wide."""

@@ -16,12 +16,13 @@ from typing import Any, Self
 import numpy as np
 import numpy.typing as npt
 
+from recon.arrays import Float32Array
 from recon.base.threads import linear_algebra_on_one_thread
 from recon.camera.camera_model import Extent, choose_model
 from recon.camera.refocus_field import at_depth
 from recon.errors import InputError
 from recon.reconstruction.first_look import look_at
-from recon.reconstruction.measurement import Floats, Measurement, depths_of
+from recon.reconstruction.measurement import Measurement, depths_of
 from recon.reconstruction.options import Overrides, ReconstructionOptions
 from recon.reconstruction.part import Part, parts_of
 from recon.reconstruction.problem import Problem
@@ -53,7 +54,7 @@ def stream_problem(
     options: ReconstructionOptions | None = None,
     *,
     choosing: bool = True,
-    others: Sequence[Floats] = (),
+    others: Sequence[Float32Array] = (),
     extent: Extent | None = None,
     **overrides: Any,
 ) -> Problem:
@@ -114,7 +115,10 @@ def stream_problem(
 
 
 def _chosen(
-    frame: Measurement, others: Sequence[Floats], calibration: Calibration, options: ReconstructionOptions
+    frame: Measurement,
+    others: Sequence[Float32Array],
+    calibration: Calibration,
+    options: ReconstructionOptions,
 ) -> tuple[ReconstructionOptions, Extent | None, str, str]:
     """Choose camera model, background and field for a film by the mean of several of its frames.
 
@@ -237,7 +241,7 @@ class VideoSolver:
         """Forget the frames before: the next one starts cold."""
         self._cold = True
 
-    def next(self, frame: Floats) -> Floats:
+    def next(self, frame: Float32Array) -> Float32Array:
         """Return the picture (height, width[, n_channels]) of the next frame; of several depths the volume.
 
         Parameters
@@ -256,7 +260,7 @@ class VideoSolver:
         return self.picture()
 
     @linear_algebra_on_one_thread()
-    def take(self, frame: Floats) -> None:
+    def take(self, frame: Float32Array) -> None:
         """Take a frame as of :meth:`next`, to be iterated by :meth:`advance`."""
         self.problem = self._first.with_data(frame)
         if self._cold:
@@ -296,7 +300,7 @@ class VideoSolver:
         self._calm = 0 if missing else self._calm
         return not missing
 
-    def volume(self) -> Floats:
+    def volume(self) -> Float32Array:
         """Return what there is of the newest frame, (n_z, height, width[, n_channels]), measurement units."""
         return self.problem.whole(
             [
@@ -305,7 +309,7 @@ class VideoSolver:
             ]
         )
 
-    def picture(self) -> Floats:
+    def picture(self) -> Float32Array:
         """Return the same; of one depth its picture."""
         volume = self.volume()
         return volume[0] if self.problem.n_planes == 1 else volume

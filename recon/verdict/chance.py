@@ -21,9 +21,10 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-Floats = npt.NDArray[np.float64]
+from recon.arrays import BoolArray, Float64Array
+
 Parts = npt.NDArray[np.int_]
-Regress = Callable[[Floats, Floats, float], Floats]
+Regress = Callable[[Float64Array, Float64Array, float], Float64Array]
 
 SHIPPED = Path(__file__).with_name("chances.json")
 """The regressions that come with the program, by group of methods."""
@@ -86,18 +87,18 @@ class Chances:
     """What is known of a group of methods."""
 
     features: tuple[str, ...]
-    centre: Floats
-    spread: Floats
+    centre: Float64Array
+    spread: Float64Array
     """``centre`` and ``spread``: (n_features,): mean and standard deviation of the cases' places."""
-    best: Floats
+    best: Float64Array
     """(n_features, 2): the lowest and the highest among the cases."""
-    typical: Floats
+    typical: Float64Array
     """(n_features,): the median of the good cases."""
-    coefficients: Floats
+    coefficients: Float64Array
     """(1 + 2 n_features,): of :func:`_terms`, for the logarithm of the odds."""
-    joint: Floats
+    joint: Float64Array
     """(1 + n_features (n_features + 3) / 2,): of :func:`_joint_terms`, likewise, by the severity."""
-    precision: Floats
+    precision: Float64Array
     """(n_features, n_features): inverse of the cases' scatter, in units of ``spread``."""
     far: float
     """The farthest case's distance: beyond, a measurement is unlike every case."""
@@ -106,24 +107,24 @@ class Chances:
     n_cases: int
     n_scenes: int
 
-    def chance(self, places: Floats) -> Floats:
+    def chance(self, places: Float64Array) -> Float64Array:
         """Return the chance of failing at places (..., n_features)."""
         steps = self._steps(places)
         return _logistic((_terms(steps) @ self.coefficients + _joint_terms(steps) @ self.joint) / 2)
 
-    def blame(self, places: Floats) -> Floats:
+    def blame(self, places: Float64Array) -> Float64Array:
         """Return the chance of failing by the regression in which each number has its own share."""
         return _logistic(_terms(self._steps(places)) @ self.coefficients)
 
-    def _steps(self, places: Floats) -> Floats:
+    def _steps(self, places: Float64Array) -> Float64Array:
         return np.asarray(np.clip((places - self.centre) / self.spread, -MOST, MOST))
 
-    def distance(self, place: Floats) -> float:
+    def distance(self, place: Float64Array) -> float:
         """Return how far a place (n_features,) is from the cases' middle."""
         step = (place - self.centre) / self.spread
         return float(np.sqrt(step @ self.precision @ step))
 
-    def no_better_than_any(self, place: Floats) -> Floats:
+    def no_better_than_any(self, place: Float64Array) -> Float64Array:
         """Return a place moved to the best case's where it is better: more light than the most is as good."""
         moved = place.copy()
         for index, name in enumerate(self.features):
@@ -162,7 +163,7 @@ def is_whole(evidence: Mapping[str, Any], features: Sequence[str]) -> bool:
     return {*features} - {*DERIVED} <= {*evidence}
 
 
-def place_of(evidence: Mapping[str, float], features: Sequence[str]) -> Floats:
+def place_of(evidence: Mapping[str, float], features: Sequence[str]) -> Float64Array:
     """Return where evidence lies among cases, (n_features,): logarithms."""
     beyond2 = (evidence["signal"] * evidence["unexplained"]) ** 2
     numbers = {
@@ -183,10 +184,10 @@ def value_of(name: str, coordinate: float) -> float:
 
 def fitted(
     features: Sequence[str],
-    places: Floats,
-    severities: Floats,
+    places: Float64Array,
+    severities: Float64Array,
     scenes: npt.ArrayLike,
-    decides: npt.NDArray[np.bool_] | None = None,
+    decides: BoolArray | None = None,
 ) -> Chances:
     """Fit the regression to cases.
 
@@ -211,7 +212,7 @@ def fitted(
     folds = [rng.permutation(len(groups))[group] % FOLDS for _ in range(SPLITS)]
     signs = np.array([-BETTER.get(name, 0) for name in features])
 
-    def regressed(terms: Floats, failed: Floats, strength: float) -> Floats:
+    def regressed(terms: Float64Array, failed: Float64Array, strength: float) -> Float64Array:
         return _regressed(terms, failed, strength, signs)
 
     odds = {p: _left_out(regressed, terms, failed, folds, p) for p in PENALTIES}
@@ -247,29 +248,29 @@ def fitted(
     )
 
 
-def _terms(steps: Floats) -> Floats:
+def _terms(steps: Float64Array) -> Float64Array:
     """Return 1, the steps and their squares: (..., n) to (..., 1 + 2 n)."""
     return np.concatenate([np.ones((*steps.shape[:-1], 1)), steps, steps**2], axis=-1)
 
 
-def _joint_terms(steps: Floats) -> Floats:
+def _joint_terms(steps: Float64Array) -> Float64Array:
     """Return 1, the steps, their squares and products: (..., n) to (..., 1 + n + n (n + 1) / 2)."""
     one, other = np.triu_indices(steps.shape[-1])
     products = steps[..., one] * steps[..., other]
     return np.concatenate([np.ones((*steps.shape[:-1], 1)), steps, products], axis=-1)
 
 
-def _logistic(logits: Floats) -> Floats:
+def _logistic(logits: Float64Array) -> Float64Array:
     return np.asarray(1 / (1 + np.exp(-np.clip(logits, -50, 50))))
 
 
-def _surprise(logits: Floats, failed: Floats) -> float:
+def _surprise(logits: Float64Array, failed: Float64Array) -> float:
     return float(np.sum(np.logaddexp(0, logits) - failed * logits))
 
 
 def _left_out(
-    regress: Regress, terms: Floats, wanted: Floats, folds: Sequence[Parts], penalty: float
-) -> Floats:
+    regress: Regress, terms: Float64Array, wanted: Float64Array, folds: Sequence[Parts], penalty: float
+) -> Float64Array:
     """Return what regressions on the other parts say of each case, the mean over partings."""
     told = np.zeros(len(wanted))
     for fold in folds:
@@ -279,14 +280,14 @@ def _left_out(
     return told
 
 
-def _ridge(terms: Floats, wanted: Floats, strength: float) -> Floats:
+def _ridge(terms: Float64Array, wanted: Float64Array, strength: float) -> Float64Array:
     """Return the coefficients of a linear ridge regression on :func:`_joint_terms`."""
     n = int((2 * terms.shape[1]) ** 0.5) - 1  # of (n + 1) (n + 2) / 2 terms
     penalty = strength * np.repeat([0.0, 1.0, JOINT_BENT], [1, n, terms.shape[1] - 1 - n])
     return np.asarray(np.linalg.solve(terms.T @ terms + np.diag(penalty), terms.T @ wanted))
 
 
-def _curve(told: Floats, failed: Floats) -> tuple[float, float]:
+def _curve(told: Float64Array, failed: Float64Array) -> tuple[float, float]:
     """Return offset and slope of the logistic curve from what was told to the chance (Platt, 1999)."""
     from scipy.optimize import minimize
 
@@ -294,7 +295,9 @@ def _curve(told: Floats, failed: Floats) -> tuple[float, float]:
     return float(found[0]), float(found[1])
 
 
-def _regressed(terms: Floats, failed: Floats, strength: float, signs: npt.NDArray[np.int_]) -> Floats:
+def _regressed(
+    terms: Float64Array, failed: Float64Array, strength: float, signs: npt.NDArray[np.int_]
+) -> Float64Array:
     """Return the coefficients of a logistic ridge regression on :func:`_terms`.
 
     A feature of sign 1 never lowers the chance within :data:`MOST`, one of -1 never lifts it: what is fitted
@@ -308,7 +311,7 @@ def _regressed(terms: Floats, failed: Floats, strength: float, signs: npt.NDArra
     mean, bend = np.eye(n) / 2, np.eye(n) / (4 * MOST)
     of_slopes[1:, 1:] = np.block([[mean, mean], [-bend, bend]])
 
-    def objective(slopes: Floats) -> tuple[float, Floats]:
+    def objective(slopes: Float64Array) -> tuple[float, Float64Array]:
         at = of_slopes @ slopes
         logits = terms @ at
         slope = terms.T @ (_logistic(logits) - failed) + penalty * at

@@ -11,8 +11,9 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-Floats = npt.NDArray[np.float32]
-Left = Callable[[Floats, Floats], float]
+from recon.arrays import Float32Array
+
+Left = Callable[[Float32Array, Float32Array], float]
 
 GAMMA = 2.2
 """Of files for the eye; sRGB's own curve is as close to this power as its quantisation."""
@@ -45,7 +46,7 @@ class Coded:
         """Value of ``--srgb``."""
         return "both" if self.psf else "photograph"
 
-    def straightened(self, photograph: Floats, psfs: Floats) -> tuple[Floats, Floats]:
+    def straightened(self, photograph: Float32Array, psfs: Float32Array) -> tuple[Float32Array, Float32Array]:
         """Return both in proportion to the light."""
         return straight(photograph), straight(psfs) if self.psf else psfs
 
@@ -53,7 +54,7 @@ class Coded:
 CODED = (Coded(False), Coded(True))
 
 
-def coded(photograph: Floats, psfs: Floats, left: Left, *, asked: bool = False) -> Coded | None:
+def coded(photograph: Float32Array, psfs: Float32Array, left: Left, *, asked: bool = False) -> Coded | None:
     """Return what is coded, None where nothing is or the photograph does not tell.
 
     Parameters
@@ -72,7 +73,7 @@ def coded(photograph: Floats, psfs: Floats, left: Left, *, asked: bool = False) 
     return best if least[best] < STRAIGHTER else None
 
 
-def straight(image: npt.ArrayLike) -> Floats:
+def straight(image: npt.ArrayLike) -> Float32Array:
     """Return what was gamma-coded in proportion to the light."""
     values = np.maximum(np.asarray(image, np.float32), 0)
     top = max(float(values.max()), 1e-30)

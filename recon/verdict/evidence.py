@@ -9,16 +9,14 @@ from collections import deque
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from itertools import pairwise
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
+from recon.arrays import Array, BoolArray, Float64Array
 from recon.base import fft
 from recon.base.checks import as_channels, saturated_share
 from recon.solvers.base import IterationRecord, StoppingRules, StopReason
-
-Array = npt.NDArray[Any]
 
 NEAR_PX = 2
 """Shifts up to here, or up to the full width of the PSF's autocorrelation, belong to its own sharpness."""
@@ -92,7 +90,7 @@ class Observation:
 
     data: Array
     """(height, width): measurement, background subtracted, in units of its noise."""
-    valid: npt.NDArray[np.bool_]
+    valid: BoolArray
     """(height, width)."""
     noise: float
     """Its deviation, counts."""
@@ -172,7 +170,7 @@ def _dimming(psfs: Array) -> float:
     return float(norms.min() / norms.max()) if norms.max() > 0 else 1.0
 
 
-def _norms(psfs: Array) -> npt.NDArray[np.float64]:
+def _norms(psfs: Array) -> Float64Array:
     return np.sqrt([_inner(psf, psf) for psf in psfs])
 
 
@@ -265,7 +263,7 @@ class Points:
     gathers, or where the scene goes on beyond the calibrated depths."""
 
 
-def points_of(volume: Array, norms: npt.NDArray[np.float64], count: int) -> Points:
+def points_of(volume: Array, norms: Float64Array, count: int) -> Points:
     """Measure the bright points of a volume, three planes in memory at a time.
 
     Parameters
@@ -311,7 +309,7 @@ def points_of(volume: Array, norms: npt.NDArray[np.float64], count: int) -> Poin
 
 # From a result --------------------------------------------------------------------------------------
 def observations(
-    measurement: npt.ArrayLike, data: Array, valid: npt.NDArray[np.bool_], noise: Array
+    measurement: npt.ArrayLike, data: Array, valid: BoolArray, noise: Array
 ) -> list[Observation]:
     """Return what the camera saw, a channel each.
 

@@ -15,9 +15,10 @@ from typing import Any
 
 import numpy as np
 
+from recon.arrays import Float64Array
 from recon.verdict.calibration_check import CalibrationCheck, Fit
 from recon.verdict.cases import OF_VOLUMES, group_of
-from recon.verdict.chance import BETTER, Chances, Floats, place_of, shipped_chances, value_of
+from recon.verdict.chance import BETTER, Chances, place_of, shipped_chances, value_of
 from recon.verdict.evidence import DIVERGED, Evidence
 
 
@@ -264,7 +265,7 @@ def verdict_on(evidence: Evidence, method: str, chances: Chances | None = None) 
     return Verdict(region, method, chance, findings, numbers, basis, decided)
 
 
-def _place(chances: Chances, numbers: Mapping[str, float]) -> Floats:
+def _place(chances: Chances, numbers: Mapping[str, float]) -> Float64Array:
     """Return where numbers lie among the cases."""
     return chances.no_better_than_any(place_of(numbers, chances.features))
 

@@ -31,12 +31,11 @@ from dataclasses import asdict, dataclass, field, fields
 from typing import Any, Literal
 
 import numpy as np
-import numpy.typing as npt
 
+from recon.arrays import Array, BoolArray, Float64Array
 from recon.base import metrics
 from recon.solvers.base import IterationRecord, StopReason
 
-Image = npt.NDArray[Any]
 Size = Literal["quick", "full"]
 
 WORST = 99.0
@@ -78,7 +77,7 @@ def bounded(severity: float) -> float:
     return WORST if not severity <= WORST else max(float(severity), 0.0)
 
 
-def trivial_error(back_projection: Image, truth: Image) -> float:
+def trivial_error(back_projection: Array, truth: Array) -> float:
     """Return the NRMSE of the trivial reconstruction: ``a A^H b + c`` with the best ``a`` and ``c``.
 
     Parameters
@@ -92,13 +91,13 @@ def trivial_error(back_projection: Image, truth: Image) -> float:
     return float(np.linalg.norm(fitted - wanted) / np.linalg.norm(wanted))
 
 
-def relative_error(found: Image, truth: Image) -> float:
+def relative_error(found: Array, truth: Array) -> float:
     """Return the NRMSE after the best scale, for any number of dimensions."""
     a, b = (np.asarray(v, np.float64).reshape(len(v), -1) for v in (found, truth))
     return metrics.nrmse(a, b, fit_scale=True)
 
 
-def ring_correlation(found: Image, truth: Image, period_px: float) -> float:
+def ring_correlation(found: Array, truth: Array, period_px: float) -> float:
     """Return the correlation of two images (height, width) on a ring of spatial frequencies."""
     window = np.outer(*(np.hanning(n + 2)[1:-1] for n in truth.shape))
     a, b = (np.fft.rfft2(window * (v - v.mean())) for v in (found, truth))
@@ -108,7 +107,7 @@ def ring_correlation(found: Image, truth: Image, period_px: float) -> float:
     return float(np.sum(a[ring] * b[ring].conj()).real) / norm if norm > 0 else 0.0
 
 
-def resolution_severity(found: Image, truth: Image, resolved_px: float) -> float:
+def resolution_severity(found: Array, truth: Array, resolved_px: float) -> float:
     """Severity of lost resolution; ``resolved_px`` is the distance that the optics resolve."""
     return bounded(RING_CORRELATION / max(ring_correlation(found, truth, 2 * resolved_px), 1e-3))
 
@@ -214,7 +213,7 @@ def cell_of(method: str, ix: int, iy: int, trial: Trial, seconds: float) -> Cell
 
 
 def boundary(
-    x: tuple[float, ...], y: tuple[float, ...], severity: npt.NDArray[np.float64], *, logarithmic: bool
+    x: tuple[float, ...], y: tuple[float, ...], severity: Float64Array, *, logarithmic: bool
 ) -> list[tuple[float, float]]:
     """Return where each row crosses from working to failing, ``(x, y)``; other rows have no point.
 
@@ -237,7 +236,7 @@ def boundary(
     return points
 
 
-def _misplaced(fails: npt.NDArray[np.bool_], k: int) -> int:
+def _misplaced(fails: BoolArray, k: int) -> int:
     """Cells that would be on the wrong side of a border after cell ``k``."""
     return int(np.count_nonzero(fails[: k + 1] != fails[k])) + int(
         np.count_nonzero(fails[k + 1 :] != fails[k + 1])

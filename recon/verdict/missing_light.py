@@ -9,13 +9,11 @@ point is off the middle. That is the most that may lack: a pattern may end behin
 from __future__ import annotations
 
 import math
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
-Array = npt.NDArray[Any]
-Floats = npt.NDArray[np.float64]
+from recon.arrays import Array, Float64Array
 
 EDGE = 0.04
 """Width of a PSF's edges, whose mean is what lies beyond them, relative to the shorter side."""
@@ -110,7 +108,7 @@ def _darkest(psf: Array, wide: int) -> float:
     return float(read[seen <= np.quantile(seen, DARK)].mean()) if seen.size else 0.0
 
 
-def _cast(psf: Array, down: Array, across: Array) -> Floats:
+def _cast(psf: Array, down: Array, across: Array) -> Float64Array:
     """Return the light of a PSF that falls on the sensor, moved by whole pixels."""
     until = np.zeros((psf.shape[0] + 1, psf.shape[1] + 1))
     until[1:, 1:] = psf.cumsum(axis=0, dtype=np.float64).cumsum(axis=1)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import numpy as np
-import numpy.typing as npt
 import pytest
 from scipy import ndimage
 
@@ -11,6 +10,7 @@ from calibration_routines.psf.stage_fit import judge_drift
 from calibration_routines.scatter import Scatter, compare, pooled, scatter_of, steadied
 from drivers.simulated.options import WorldOptions
 from drivers.simulated.world import SimulatedWorld
+from recon.arrays import Float32Array, Float64Array
 
 RNG = np.random.default_rng(4)
 PATTERN = ndimage.gaussian_filter(np.maximum(RNG.normal(size=(80, 100)), 0), 0.9)
@@ -19,7 +19,7 @@ PATTERN *= 200 / PATTERN.max()
 Z_UM = 94e3
 
 
-Frames = npt.NDArray[np.float32]
+Frames = Float32Array
 
 
 def frames(flicker: float = 0.0, motion_px: float = 0.0, ambient: float = 0.0, n: int = 4) -> Frames:
@@ -120,7 +120,7 @@ def test_a_picture_that_only_moved_is_as_bright_as_it_was_and_no_other_light_cam
     fine = SimulatedWorld(WorldOptions(preset="tiny", time_scale=0.0))
     pitch_um = 13.0 * Z_UM / fine.distance_um
 
-    def light(down: float, right: float) -> npt.NDArray[np.float64]:
+    def light(down: float, right: float) -> Float64Array:
         psf = np.array(fine.psf((-right * pitch_um, -down * pitch_um, Z_UM), (0.0, 1.0, 0.0)))
         return psf / psf.sum()
 

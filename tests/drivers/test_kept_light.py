@@ -11,7 +11,8 @@ import pytest
 
 from drivers.simulated import kept_light, world
 from drivers.simulated.options import WorldOptions
-from drivers.simulated.world import Image, SimulatedWorld
+from drivers.simulated.world import SimulatedWorld
+from recon.arrays import Float32Array
 from recon.optics.scene import Scene, picture
 
 WHITE = (1.0, 1.0, 1.0)
@@ -30,7 +31,9 @@ def rendered(monkeypatch: pytest.MonkeyPatch) -> list[object]:
     """Count scenes that are rendered: by numbers of their own instead of optics."""
     made: list[object] = []
 
-    def render(scene: Scene, _weights: object, grid: object, *_optics: object, **_rest: object) -> Image:
+    def render(
+        scene: Scene, _weights: object, grid: object, *_optics: object, **_rest: object
+    ) -> Float32Array:
         made.append(scene)
         shape = grid.shape  # type: ignore[attr-defined]
         return np.random.default_rng(len(made)).random(shape, np.float32)
@@ -46,7 +49,7 @@ def lit(**options: object) -> SimulatedWorld:
     return found
 
 
-def light(of: SimulatedWorld, binning: int = 1) -> Image:
+def light(of: SimulatedWorld, binning: int = 1) -> Float32Array:
     found = of.photons_per_s(WHITE, binning)
     assert found is not None
     return found

@@ -10,7 +10,6 @@ from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
-import numpy.typing as npt
 import pytest
 from pydantic import ValidationError
 
@@ -26,6 +25,7 @@ from drivers.simulated.options import WorldOptions
 from drivers.simulated.slm import SimulatedSlm, SlmOptions
 from drivers.simulated.stage import AxisOptions, SimulatedStage, StageOptions
 from drivers.simulated.world import Rgb, SimulatedWorld
+from recon.arrays import Float32Array, Float64Array
 
 Z_UM = 100e3
 
@@ -49,12 +49,12 @@ class Bench:
         self.stage.home()
         self.camera.set_exposure_ms(1.0)
 
-    def lit(self, rgb: tuple[int, int, int] = (0, 255, 0)) -> npt.NDArray[np.float64]:
+    def lit(self, rgb: tuple[int, int, int] = (0, 255, 0)) -> Float64Array:
         """Photograph with LED 0 on; counts above the black level."""
         self.leds.set_pattern(self.leds.single(0, rgb))
         return self.counts()
 
-    def counts(self) -> npt.NDArray[np.float64]:
+    def counts(self) -> Float64Array:
         return self.camera.snap().image.astype(np.float64) - round(self.camera.black_level)
 
 
@@ -102,7 +102,7 @@ def test_the_pattern_moves_against_the_stage() -> None:
     grid = bench.world.sensor_grid()
     bench.stage.move_to({"x_um": 0.0, "y_um": 0.0, "z_um": Z_UM})
 
-    def centre(image: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+    def centre(image: Float64Array) -> Float64Array:
         return np.array([image.sum(axis=0) @ grid.x_um, image.sum(axis=1) @ grid.y_um]) / image.sum()
 
     start = centre(bench.lit())
@@ -423,10 +423,10 @@ def test_a_large_sensor_tells_coarsely_what_its_frame_will_show(monkeypatch: pyt
     monkeypatch.setattr(world, "COARSE_PIXELS", 1200)
     bench = Bench()
     bench.world.scene_lit = True
-    found: list[tuple[npt.NDArray[np.float64], int] | None] = []
+    found: list[tuple[Float64Array, int] | None] = []
     absorbed = bench.camera._absorbed
 
-    def watched(*given: object) -> npt.NDArray[np.float32]:
+    def watched(*given: object) -> Float32Array:
         found.append(bench.camera.coarse())
         return absorbed(*given)  # type: ignore[arg-type]
 
@@ -616,7 +616,7 @@ def test_leds_light_the_scene_part_by_part_and_add_up() -> None:
     bench.camera.set_exposure_ms(0.2)
     assert bench.counts().max() <= 1
 
-    def lit(*numbers: int) -> npt.NDArray[np.float32]:
+    def lit(*numbers: int) -> Float32Array:
         bench.leds.set_pattern(LedPattern("some", tuple((n, (255, 255, 255)) for n in numbers)))
         light = bench.world.photons_per_s((1.0, 1.0, 1.0))
         assert light is not None
@@ -632,5 +632,5 @@ def test_leds_light_the_scene_part_by_part_and_add_up() -> None:
     assert bench.counts().max() <= 1
 
 
-def leds_x(bench: Bench) -> npt.NDArray[np.float64]:
+def leds_x(bench: Bench) -> Float64Array:
     return bench.leds.led_positions_mm[:, 0]

@@ -9,6 +9,7 @@ import pytest
 from drivers.simulated.options import WorldOptions
 from drivers.simulated.screen import ScreenOptions, SimulatedScreen
 from drivers.simulated.world import SimulatedWorld
+from recon.arrays import Float32Array
 from recon.camera.registration import register
 
 WHITE = (1.0, 1.0, 1.0)
@@ -26,7 +27,7 @@ ASKEW = ScreenOptions(
 )
 
 
-def lit(world: SimulatedWorld) -> npt.NDArray[np.float32]:
+def lit(world: SimulatedWorld) -> Float32Array:
     light = world.photons_per_s(WHITE)
     assert light is not None
     return light

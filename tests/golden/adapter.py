@@ -16,9 +16,9 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 import recon
+from recon.arrays import Array
 from recon.base import threads
 from recon.holography import (
     DcTerm,
@@ -47,7 +47,7 @@ def threads_used(count: int) -> Iterator[None]:
         threads.set_threads(before)
 
 
-def _calibration(given: Calibration | npt.NDArray[Any]) -> Any:
+def _calibration(given: Calibration | Array) -> Any:
     if isinstance(given, np.ndarray):
         return given
     geometry = recon.Geometry(given["pitch_um"], given["distance_mm"])
@@ -66,48 +66,42 @@ def wishes(**wanted: str) -> Any:
     return Overrides.parse(wanted)
 
 
-def picture(
-    measurement: npt.NDArray[Any], calibration: Calibration | npt.NDArray[Any], **options: Any
-) -> Result:
+def picture(measurement: Array, calibration: Calibration | Array, **options: Any) -> Result:
     """Reconstruct a picture of one depth."""
     return _of_picture(recon.reconstruct(measurement, _calibration(calibration), **_iterated(options)))
 
 
-def volume(measurement: npt.NDArray[Any], calibration: Calibration, **options: Any) -> Result:
+def volume(measurement: Array, calibration: Calibration, **options: Any) -> Result:
     """Reconstruct a volume."""
     return _of_volume(recon.reconstruct(measurement, _calibration(calibration), **_iterated(options)))
 
 
-def picture_on_device(measurement: npt.NDArray[Any], psf: npt.NDArray[Any], **options: Any) -> Result:
+def picture_on_device(measurement: Array, psf: Array, **options: Any) -> Result:
     """Reconstruct a picture as on a GPU, its array library played by NumPy."""
     with played():
         return picture(measurement, psf, device="gpu", **options)
 
 
-def volume_on_device(measurement: npt.NDArray[Any], calibration: Calibration, **options: Any) -> Result:
+def volume_on_device(measurement: Array, calibration: Calibration, **options: Any) -> Result:
     """Reconstruct a volume as on a GPU, its array library played by NumPy."""
     with played():
         return volume(measurement, calibration, device="gpu", **options)
 
 
-def started_picture(
-    first: npt.NDArray[Any], second: npt.NDArray[Any], psf: npt.NDArray[Any], **options: Any
-) -> Result:
+def started_picture(first: Array, second: Array, psf: Array, **options: Any) -> Result:
     """Reconstruct a picture from where that of another measurement ended."""
     cold = recon.reconstruct(first, psf, **_iterated(options))
     return picture(second, psf, warm=cold, **options)
 
 
-def started_volume(
-    first: npt.NDArray[Any], second: npt.NDArray[Any], calibration: Calibration, **options: Any
-) -> Result:
+def started_volume(first: Array, second: Array, calibration: Calibration, **options: Any) -> Result:
     """Reconstruct a volume from where that of another measurement ended."""
     cold = recon.reconstruct(first, _calibration(calibration), **_iterated(options))
     return volume(second, calibration, warm=cold, **options)
 
 
 def resumed(
-    kind: str, measurement: npt.NDArray[Any], calibration: Any, *, after: int, iterations: int, **options: Any
+    kind: str, measurement: Array, calibration: Any, *, after: int, iterations: int, **options: Any
 ) -> Result:
     """Keep a reconstruction in a folder after some iterations, and go on with it."""
     from instrument.reconstruction.checkpointing import CheckpointFolder
@@ -122,7 +116,7 @@ def resumed(
 
 
 def scratch_volume(
-    measurement: npt.NDArray[Any], calibration: Calibration, *, memory_gib: float, **options: Any
+    measurement: Array, calibration: Calibration, *, memory_gib: float, **options: Any
 ) -> Result:
     """Reconstruct a volume with a memory limit, the rest in files."""
     with TemporaryDirectory() as folder:
@@ -136,15 +130,13 @@ def scratch_volume(
     return {**_of_volume(found), "files": str(found.provenance["memory"])}
 
 
-def patterned(
-    frames: npt.NDArray[Any], light: npt.NDArray[Any], psf: npt.NDArray[Any], **options: Any
-) -> Result:
+def patterned(frames: Array, light: Array, psf: Array, **options: Any) -> Result:
     """Reconstruct one picture from frames under patterns of light."""
     measurement = recon.Measurement(frames, patterns=light)
     return _of_picture(recon.reconstruct(measurement, psf, tolerance=2e-4, **options))
 
 
-def video(frames: npt.NDArray[Any], psf: npt.NDArray[Any], *, cold: int, warm: int, **options: Any) -> Result:
+def video(frames: Array, psf: Array, *, cold: int, warm: int, **options: Any) -> Result:
     """Reconstruct frames one after the other, each from where the one before ended; begin anew half way."""
     from recon.streams.video import VideoSolver, stream_problem
 
@@ -159,7 +151,7 @@ def video(frames: npt.NDArray[Any], psf: npt.NDArray[Any], *, cold: int, warm: i
     return {"image": np.stack(pictures), "weight": solver.weights[0]}
 
 
-def joint(frames: npt.NDArray[Any], psf: npt.NDArray[Any], over_time: Any, **options: Any) -> Result:
+def joint(frames: Array, psf: Array, over_time: Any, **options: Any) -> Result:
     """Reconstruct frames together, with a prior over time."""
     from recon.streams.joint import solve_together
     from recon.streams.video import stream_problem
@@ -167,9 +159,7 @@ def joint(frames: npt.NDArray[Any], psf: npt.NDArray[Any], over_time: Any, **opt
     return {"image": solve_together(stream_problem(frames[0], psf), frames, over_time, **options)}
 
 
-def live(
-    frames: Sequence[npt.NDArray[Any]], psf: npt.NDArray[Any], *, refinements: int, **options: Any
-) -> Result:
+def live(frames: Sequence[Array], psf: Array, *, refinements: int, **options: Any) -> Result:
     """Feed frames as a running camera does, and refine each so many times by one iteration.
 
     Iterations are counted, not timed: the budget leaves room for one iteration a frame at most.
@@ -190,7 +180,7 @@ def live(
     return {"image": np.stack(pictures), "said": "; ".join(said), "iterations": str(done)}
 
 
-def from_files(images: Mapping[str, npt.NDArray[Any]], *arguments: str) -> Result:
+def from_files(images: Mapping[str, Array], *arguments: str) -> Result:
     """Reconstruct through the command line from image files (``image``, and ``psf`` or ``volume``)."""
     import tifffile
 
@@ -232,7 +222,7 @@ def command_names() -> list[tuple[str, ...]]:
 
 
 def hologram(  # noqa: PLR0913 - what the cases vary
-    targets: Sequence[tuple[npt.NDArray[Any], float]],
+    targets: Sequence[tuple[Array, float]],
     slm: tuple[int, int],
     *,
     pixels: int = 2,

@@ -10,7 +10,8 @@ import numpy as np
 import numpy.typing as npt
 from scipy.ndimage import gaussian_filter
 
-Floats = npt.NDArray[np.float64]
+from recon.arrays import BoolArray, Float32Array, Float64Array
+
 Point = tuple[float, float, float, float]
 """Row and column from the axis in pixels, depth plane (may lie between two), light."""
 
@@ -21,12 +22,12 @@ READ_NOISE = 2.0
 BEADS: tuple[Point, ...] = ((-9.3, 4.6, 0.2, 9000.0), (6.4, -7.7, 1.9, 7000.0), (2.1, 9.2, 1.1, 8000.0))
 
 
-def depths_um(count: int) -> Floats:
+def depths_um(count: int) -> Float64Array:
     """Depths evenly spaced in 1/z, the farthest first."""
     return np.linspace(1 / 25, 1 / 8, count) ** -1 * 1000
 
 
-def _lenses(shape: tuple[int, int], seed: int) -> Floats:
+def _lenses(shape: tuple[int, int], seed: int) -> Float64Array:
     return np.random.default_rng(seed).uniform(-0.3, 0.3, (18, 2)) * shape
 
 
@@ -37,7 +38,7 @@ def cast(
     seed: int = 0,
     depths: int = 3,
     stretch: float = 0.0,
-) -> Floats:
+) -> Float64Array:
     """Draw what random lenslets cast of points: a Gaussian spot a lenslet, at continuous places.
 
     ``stretch`` moves each lenslet's spot outwards by that share of the point's distance from the axis, so
@@ -56,18 +57,18 @@ def cast(
 
 
 @cache
-def psf(shape: tuple[int, int] = SHAPE, seed: int = 0) -> Floats:
+def psf(shape: tuple[int, int] = SHAPE, seed: int = 0) -> Float64Array:
     """One PSF on the axis."""
     return cast([(0, 0, 0, 50.0)], shape=shape, seed=seed, depths=1)
 
 
-def noisy(image: Floats, seed: int) -> Floats:
+def noisy(image: Float64Array, seed: int) -> Float64Array:
     """Add photon noise and read noise, counts."""
     rng = np.random.default_rng(seed)
     return rng.poisson(np.maximum(image, 0)) + rng.normal(0, READ_NOISE, image.shape)
 
 
-def strokes(shape: tuple[int, int] = SHAPE, seed: int = 3) -> Floats:
+def strokes(shape: tuple[int, int] = SHAPE, seed: int = 3) -> Float64Array:
     """Smooth bright shapes on black."""
     rng = np.random.default_rng(seed)
     y, x = np.mgrid[: shape[0], : shape[1]]
@@ -82,7 +83,7 @@ def strokes(shape: tuple[int, int] = SHAPE, seed: int = 3) -> Floats:
 @cache
 def photograph(
     shape: tuple[int, int] = SHAPE, seed: int = 1, channels: int = 0, dense: bool = False
-) -> npt.NDArray[np.float32]:
+) -> Float32Array:
     """A photograph of shapes through :func:`psf`: summed shift by shift, so that no FFT is in it."""
     height, width = shape
     kernel = psf(shape) / 50.0
@@ -120,7 +121,7 @@ def over_field(depths: int = 1, shape: tuple[int, int] = SHAPE, stretch: float =
     return _arrays(np.stack(psfs)[:, None], np.array(positions))
 
 
-def _arrays(psfs: Floats, positions: Floats) -> dict[str, Any]:
+def _arrays(psfs: Float64Array, positions: Float64Array) -> dict[str, Any]:
     return {
         "psfs": np.ascontiguousarray(psfs, np.float32),
         "positions_um": np.asarray(positions, np.float64),
@@ -137,7 +138,7 @@ def beads(
     background: float = 0.0,
     channels: int = 0,
     seed: int = 2,
-) -> npt.NDArray[np.float32]:
+) -> Float32Array:
     """A photograph of three beads, in a volume or, with one depth, flat; ``background`` adds a smooth one."""
     points = [(y, x, min(z, depths - 1.0) if depths > 1 else 0, light) for y, x, z, light in BEADS]
     image = cast(points, shape=shape, depths=depths, stretch=stretch)
@@ -148,12 +149,12 @@ def beads(
     return np.stack([noisy(image * (1 - 0.2 * c), seed + c) for c in range(channels)], -1).astype(np.float32)
 
 
-def erased(shape: tuple[int, int] = SHAPE, share: float = 0.3) -> npt.NDArray[np.bool_]:
+def erased(shape: tuple[int, int] = SHAPE, share: float = 0.3) -> BoolArray:
     """Which pixels tell nothing."""
     return np.random.default_rng(5).random(shape) < share
 
 
-def patterns(shape: tuple[int, int] = SHAPE) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.float32]]:
+def patterns(shape: tuple[int, int] = SHAPE) -> tuple[Float32Array, Float32Array]:
     """Frames of one scene under four patterns of light, and the patterns."""
     y, x = np.mgrid[: shape[0], : shape[1]]
     light = np.stack([1 + 0.8 * np.cos(2 * np.pi * (x / 11 + y / 17) + k * np.pi / 2) for k in range(4)])
@@ -167,7 +168,7 @@ def patterns(shape: tuple[int, int] = SHAPE) -> tuple[npt.NDArray[np.float32], n
     return np.asarray(frames, np.float32), light.astype(np.float32)
 
 
-def frames(count: int, shape: tuple[int, int] = SHAPE, step: float = 0.5) -> npt.NDArray[np.float32]:
+def frames(count: int, shape: tuple[int, int] = SHAPE, step: float = 0.5) -> Float32Array:
     """A video of three beads, one of which moves ``step`` pixels a frame."""
     made = []
     for n in range(count):
@@ -184,7 +185,7 @@ def mosaic(shape: tuple[int, int] = SHAPE) -> npt.NDArray[np.uint16]:
     return np.clip(np.round(raw + 100), 0, 65535).astype(np.uint16)
 
 
-def shown(shape: tuple[int, int]) -> Floats:
+def shown(shape: tuple[int, int]) -> Float64Array:
     """A picture for holograms: smooth shapes and edges between 0 and 1."""
     y, x = np.mgrid[0 : 1 : shape[0] * 1j, 0 : 1 : shape[1] * 1j]
     image = 0.5 + 0.3 * np.sin(7 * x + 3 * y)

@@ -12,8 +12,8 @@ from dataclasses import astuple
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
+from recon.arrays import BoolArray, Float64Array
 from recon.camera.convolution import Convolution
 from recon.camera.factors import BackgroundRemoval, Erasures, interpolate_bayer
 from recon.camera.grid import Grid, metric_volume
@@ -64,12 +64,12 @@ BY_DEPTH = np.stack([np.linspace(0.3, 0.9, N_Z), np.ones(N_Z), np.linspace(1, 2,
 LATERAL = TotalVariation(0.02, axis_weights=(0.5, 1, 2), wrap=(False,) * 3) + NonNegativity()
 
 
-def masked(valid: npt.NDArray[np.bool_] = VALID) -> Any:
+def masked(valid: BoolArray = VALID) -> Any:
     """Return the picture's camera with erased pixels."""
     return Erasures(valid, PICTURE.range_shape, np.float64) @ PICTURE
 
 
-def lit(camera: Any, number: int = 0) -> npt.NDArray[np.float64]:
+def lit(camera: Any, number: int = 0) -> Float64Array:
     """Return noisy data of a scene of two bright blocks, in one plane; the second is the first, moved."""
     scene = np.zeros(camera.domain_shape)
     if scene.ndim == 3:
@@ -160,7 +160,7 @@ def of_empty_planes(prior: Prior) -> Result:
     return way(solver, 30) | result
 
 
-def varying(model: Any, points: npt.NDArray[np.float64] = ON_GRID, **options: Any) -> Any:
+def varying(model: Any, points: Float64Array = ON_GRID, **options: Any) -> Any:
     """Return a camera whose PSF varies over the field."""
     fields = [FieldOfPsfs(psfs, points) for psfs in PSFS]
     return model(fields, SENSOR, dtype=np.float64, **options)

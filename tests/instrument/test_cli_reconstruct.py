@@ -14,7 +14,6 @@ from typing import Any
 
 import cv2
 import numpy as np
-import numpy.typing as npt
 import pytest
 import tifffile
 from scipy.signal import convolve2d
@@ -24,6 +23,7 @@ from instrument.files.calibration_file import save_calibration
 from instrument.files.images import read_image, write_image
 from instrument.reconstruction.request import PictureRequest
 from instrument.reconstruction.stored_result import open_result
+from recon.arrays import Array, BoolArray, Float64Array
 from recon.priors import PRIORS
 from recon.reconstruction.options import ReconstructionOptions
 from recon.reconstruction.problem import Problem
@@ -38,7 +38,7 @@ ENVIRONMENT = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[2])}
 SOURCES = ((20, 25), (30, 45))
 
 
-def psf_image() -> npt.NDArray[np.float64]:
+def psf_image() -> Float64Array:
     psf = np.zeros(SHAPE)
     psf[16:32, 22:42] = RNG.random((16, 20)) ** 8
     return psf
@@ -47,7 +47,7 @@ def psf_image() -> npt.NDArray[np.float64]:
 PSF = psf_image()
 
 
-def photograph() -> npt.NDArray[np.float64]:
+def photograph() -> Float64Array:
     """Points of light seen by the camera, by plain summation in space."""
     scene = np.zeros(SHAPE)
     for row, column in SOURCES:
@@ -57,7 +57,7 @@ def photograph() -> npt.NDArray[np.float64]:
     return full[top : top + SHAPE[0], left : left + SHAPE[1]]
 
 
-def counts(image: npt.NDArray[Any], scale: float, dtype: str) -> npt.NDArray[Any]:
+def counts(image: Array, scale: float, dtype: str) -> Array:
     return np.asarray(np.round(image / PSF.max() * scale) + OFFSET, dtype)
 
 
@@ -74,7 +74,7 @@ SHARP = ("--iterations", "60", "--tau", "1e-5", "--out", "out.tif")
 QUICK = ("--iterations", "30", "--out", "out.tif")
 
 
-def brightest(image: npt.NDArray[Any]) -> set[tuple[int, int]]:
+def brightest(image: Array) -> set[tuple[int, int]]:
     grey = image.mean(axis=-1) if image.ndim == 3 else image
     order = np.argsort(grey, axis=None)[-2:]
     return {(int(row), int(column)) for row, column in np.transpose(np.unravel_index(order, grey.shape))}
@@ -395,7 +395,7 @@ def test_the_hand_is_a_hand_with_five_fingers_on_black(here: Path) -> None:
     assert count_runs(hand[78:88, :].mean(axis=0) > 0.08 * white) == 1
 
 
-def count_runs(line: npt.NDArray[np.bool_]) -> int:
+def count_runs(line: BoolArray) -> int:
     """Return how many runs of at least 3 lit pixels a line has."""
     edges = np.diff(np.concatenate([[0], line.astype(int), [0]]))
     lengths = np.flatnonzero(edges == -1) - np.flatnonzero(edges == 1)

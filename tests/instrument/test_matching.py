@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 import pytest
 
 from instrument.files.errors import FileError
@@ -24,11 +23,12 @@ from instrument.reconstruction.matching import (
 from instrument.reconstruction.options import InputOptions
 from instrument.reconstruction.preparation import Crop, darkest_corner
 from recon import reconstruct
+from recon.arrays import Array
 from recon.base.blocks import block_mean
 from recon.evaluation.measured_sets import data_folder, measured_set
 from recon.evaluation.scene import make_scene
 
-Pixels = npt.NDArray[Any]
+Pixels = Array
 
 
 @pytest.fixture(scope="module")

@@ -6,7 +6,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 import pytest
 
 from instrument.files.errors import FileError
@@ -22,12 +21,13 @@ from instrument.reconstruction.matching import (
     whole_binnings,
 )
 from instrument.reconstruction.preparation import Dark, bin_image, dark_level
+from recon.arrays import Array
 from recon.types import Calibration
 
 RNG = np.random.default_rng(2)
 
 
-def file(pixels: npt.NDArray[Any], name: str = "a.tif", **facts: Any) -> ImageFile:
+def file(pixels: Array, name: str = "a.tif", **facts: Any) -> ImageFile:
     return ImageFile(Path(name), pixels, **facts)
 
 

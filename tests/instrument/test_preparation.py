@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 import pytest
 from scipy.ndimage import gaussian_filter
 
@@ -31,18 +30,17 @@ from instrument.reconstruction.preparation import (
     reduce_valid,
     saturated_pixels,
 )
+from recon.arrays import Array
 from recon.base.sloping_light import sloping_light
 from recon.errors import InputError
 from recon.types import Calibration, Geometry
 
 
-def file(pixels: npt.NDArray[Any], name: str = "file.tif") -> ImageFile:
+def file(pixels: Array, name: str = "file.tif") -> ImageFile:
     return ImageFile(Path(name), pixels)
 
 
-def psf_pixels(
-    dtype: str = "uint16", offset: int = 34, shape: tuple[int, int] = (60, 80)
-) -> npt.NDArray[Any]:
+def psf_pixels(dtype: str = "uint16", offset: int = 34, shape: tuple[int, int] = (60, 80)) -> Array:
     psf = np.full(shape, offset, np.float64)
     psf[20:40, 30:50] += 100 * np.arange(20)
     return psf.astype(dtype)
@@ -129,13 +127,13 @@ def test_a_float_psf_tells_nothing_about_the_images_offset() -> None:
     assert (dark.image, dark.psf) == (100, 0)
 
 
-def caustics(shape: tuple[int, int] = (120, 160)) -> npt.NDArray[Any]:
+def caustics(shape: tuple[int, int] = (120, 160)) -> Array:
     """A pattern of bright lines that fills its frame, counts."""
     rng = np.random.default_rng(2)
     return np.asarray(4000 * np.maximum(gaussian_filter(rng.standard_normal(shape), 3) * 10 - 1, 0))
 
 
-def in_the_middle(pattern: npt.NDArray[Any]) -> npt.NDArray[Any]:
+def in_the_middle(pattern: Array) -> Array:
     return np.asarray(np.pad(pattern[30:90, 40:120], ((30, 30), (40, 40))))
 
 
@@ -147,7 +145,7 @@ def test_light_that_grows_across_a_psf_is_taken_off_it(times: int, colours: int)
     slope = 40 + np.add.outer(2 * np.arange(120), 5 * np.arange(160)) / 2
     photograph = file(np.asarray(300 + 100 * rng.random((120 // times, 160 // times)), np.uint16))
 
-    def prepared(light: npt.NDArray[Any] | float) -> tuple[npt.NDArray[Any], str]:
+    def prepared(light: Array | float) -> tuple[Array, str]:
         psf = np.repeat((pattern + light)[..., None], colours, axis=-1).squeeze()
         noise = 3 * rng.standard_normal(psf.shape)
         job = job_from_files(
@@ -204,7 +202,7 @@ def test_an_image_darker_than_the_psfs_corners_keeps_its_own_offset() -> None:
         (psf_pixels(), np.dstack([psf_pixels()] * 3), None),
     ],
 )
-def test_pairs(psf: npt.NDArray[Any], image: npt.NDArray[Any], pattern: str | None) -> None:
+def test_pairs(psf: Array, image: Array, pattern: str | None) -> None:
     if pattern is None:
         check_pair(file(psf), file(image))
     else:
@@ -220,7 +218,7 @@ def test_mixed_depth_is_accepted_when_meant() -> None:
     ("psf", "pattern"),
     [(np.zeros((9, 9), np.uint8), "empty"), (np.full((9, 9), 7, np.uint8), "every pixel is 7")],
 )
-def test_a_psf_without_content_is_refused(psf: npt.NDArray[Any], pattern: str) -> None:
+def test_a_psf_without_content_is_refused(psf: Array, pattern: str) -> None:
     with pytest.raises(FileError, match=pattern):
         check_psf(file(psf))
 

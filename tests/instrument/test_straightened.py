@@ -15,6 +15,7 @@ from instrument.reconstruction.job import job_from_files, job_with, source_recor
 from instrument.reconstruction.options import InputOptions
 from instrument.reconstruction.request import volume_job
 from instrument.reconstruction.straightened import SrgbChoice, straightened
+from recon.arrays import Float64Array
 from recon.types import Calibration
 
 SHAPE = (40, 60)
@@ -24,7 +25,7 @@ def file(pixels: npt.NDArray[np.generic], name: str = "photo.png") -> ImageFile:
     return ImageFile(Path(name), pixels)
 
 
-def coded(light: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+def coded(light: Float64Array) -> Float64Array:
     return np.where(light <= 0.0031308, 12.92 * light, 1.055 * light ** (1 / 2.4) - 0.055)
 
 

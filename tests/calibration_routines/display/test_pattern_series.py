@@ -9,7 +9,6 @@ from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 import pytest
 from scipy.ndimage import zoom
 
@@ -29,12 +28,12 @@ from calibration_routines.scatter import NO_CHANGE, STEADY, Scatter
 from calibration_routines.times import first_guess
 from instrument.bench.bench import Bench
 from instrument.bench.config_file import parse_config
+from recon.arrays import Array
 from recon.holography import Display, random_mask
 from recon.holography.camera_map import CameraMap
 from recon.holography.learn import Lesson, learning_work
 from tests.calibration_routines.display.test_mask_alignment import small
 
-Array = npt.NDArray[Any]
 SHAPE, K, ACROSS, RIM = (24, 32), 2, 160, 8
 MASK = np.exp(1j * np.pi * np.random.default_rng(3).integers(0, 2, (SHAPE[0] * K, SHAPE[1] * K)))
 DISPLAY = Display(SHAPE, random_mask((SHAPE[0] * K, SHAPE[1] * K), seed=3), mask_fill=1.0)

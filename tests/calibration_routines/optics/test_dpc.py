@@ -7,7 +7,6 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-import numpy.typing as npt
 import pytest
 
 from calibration_routines.optics.dpc import DiffuserSurface, DpcProcedure, DpcSetup, dpc_optics
@@ -26,6 +25,7 @@ from recon.analysis.dpc import (
     slopes_deg,
     transfer,
 )
+from recon.arrays import Float32Array, Float64Array
 from recon.errors import InputError
 from tests.mocks.listeners import Following
 
@@ -123,7 +123,7 @@ def test_smooth_pictures_that_shake_make_the_surface_doubtful(tmp_path: Path) ->
     assert done.files[0].name == "doubtful_dpc.json"
 
 
-def weak_phase(shape: tuple[int, int], amplitude: float) -> npt.NDArray[np.float64]:
+def weak_phase(shape: tuple[int, int], amplitude: float) -> Float64Array:
     rng = np.random.default_rng(4)
     ky, kx = np.fft.fftfreq(shape[0])[:, None], np.fft.fftfreq(shape[1])
     noise = np.fft.fft2(rng.normal(size=shape)) * np.exp(-0.5 * (np.hypot(ky, kx) / 0.03) ** 2)
@@ -131,7 +131,7 @@ def weak_phase(shape: tuple[int, int], amplitude: float) -> npt.NDArray[np.float
     return np.asarray(phase * amplitude / phase.std())
 
 
-def halves_of(phase: npt.NDArray[np.float64], optics: DpcOptics) -> dict[str, npt.NDArray[np.float32]]:
+def halves_of(phase: Float64Array, optics: DpcOptics) -> dict[str, Float32Array]:
     axis = np.arange(-14.5, 15) * 0.009
     x, y = (side.ravel() for side in np.meshgrid(axis, axis))
     lit = np.hypot(x, y) <= optics.illumination_na

@@ -7,6 +7,7 @@ import numpy.typing as npt
 import pytest
 
 from calibration_routines.psf.analysis import DarkModel, PlaneFrames, analyse_sweep, binned, replace_hot
+from recon.arrays import Float64Array
 from recon.types import Geometry
 
 FULL = 4095
@@ -19,7 +20,7 @@ DARK_RATE[10, 20] = 1e4
 DARK_RATE[70, 80] = 1e4
 
 
-def light_at(z_um: float) -> npt.NDArray[np.float64]:
+def light_at(z_um: float) -> Float64Array:
     """Counts per millisecond of a textured shadow that scales with 1 + d/z and dims with 1/z^2."""
     magnification = 1 + 8900.0 / z_um
     rows, columns = ((np.arange(n) + 0.5 - n / 2) / magnification for n in SHAPE)
@@ -28,7 +29,7 @@ def light_at(z_um: float) -> npt.NDArray[np.float64]:
     return texture * (np.abs(y) < 40) * (np.abs(x) < 55) * 15.0 * (100e3 / z_um) ** 2
 
 
-def frames(light: npt.NDArray[np.float64], exposure_ms: float, n: int = 4) -> npt.NDArray[np.uint16]:
+def frames(light: Float64Array, exposure_ms: float, n: int = 4) -> npt.NDArray[np.uint16]:
     expected = OFFSET + (DARK_RATE + light) * exposure_ms
     noisy = expected + RANDOM.normal(size=(n, *SHAPE)) * np.sqrt(0.1 * light * exposure_ms + 1.0)
     return np.clip(np.round(noisy), 0, FULL).astype(np.uint16)

@@ -8,7 +8,6 @@ from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 import pytest
 
 from calibration_routines.psf.exposure import (
@@ -22,6 +21,7 @@ from calibration_routines.psf.exposure import (
 )
 from drivers.frame import Frame, FrameMetadata
 from drivers.led_array import LedPattern
+from recon.arrays import Float64Array
 
 BITS = 12
 FULL = (1 << BITS) - 1
@@ -34,7 +34,7 @@ class LinearCamera:
 
     def __init__(
         self,
-        light: npt.NDArray[np.float64],
+        light: Float64Array,
         exposure_ms: float = 10.0,
         limits_ms: tuple[float, float] = (0.01, 10_000.0),
         flicker: Callable[[int], float] = lambda _: 1.0,
@@ -72,7 +72,7 @@ class LinearCamera:
         return Frame(np.clip(np.round(noisy), 0, FULL).astype(np.uint16), metadata)
 
 
-def caustic(peak_counts_per_ms: float = 50.0) -> npt.NDArray[np.float64]:
+def caustic(peak_counts_per_ms: float = 50.0) -> Float64Array:
     """A pattern whose brightest pixels stand not far above its 99.9th percentile."""
     random = np.random.default_rng(0)
     light = random.random(SHAPE) ** 3

@@ -33,7 +33,7 @@ from calibration_routines.psf.sweep import Retake, read_retakes
 from calibration_routines.psf.sweep_options import LateralSweep
 from calibration_routines.psf.sweep_procedure import quality_lines
 from drivers.camera import Roi
-from drivers.simulated.world import Image, Rgb, SimulatedWorld
+from drivers.simulated.world import Rgb, SimulatedWorld
 from instrument.bench.bench import Bench, open_bench
 from instrument.bench.config_file import parse_config
 from instrument.files.calibration_file import load_calibration
@@ -42,6 +42,7 @@ from instrument.runs.acquire import look, prepare_resume
 from instrument.runs.run import FinishReason, RunCondition
 from instrument.runs.runner import RunStatus
 from recon import reconstruct
+from recon.arrays import Float32Array
 from recon.base import metrics
 from recon.camera.camera_model import ModelName
 from recon.optics.fall_off import gaussian_fall_off, no_fall_off
@@ -248,7 +249,7 @@ def test_a_drift_of_brightness_is_taken_out_of_the_psfs(
     exposures = expose_sweep(bench, SWEEP)
     bright, rendered = world.photons_per_s, 0
 
-    def counted(weights: Rgb, binning: int = 1) -> Image | None:
+    def counted(weights: Rgb, binning: int = 1) -> Float32Array | None:
         """Dim from place to place: in step with them, however late their status is heard."""
         nonlocal rendered
         rendered += 1

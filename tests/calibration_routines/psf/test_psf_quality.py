@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import numpy as np
-import numpy.typing as npt
 import pytest
 
 from calibration_routines.psf.psf_quality import judge_next, judge_sweep, measure_psf, temporal_noise
+from recon.arrays import Float32Array
 
 D_UM = 8_900.0
 SHAPE = (256, 320)
@@ -15,7 +15,7 @@ Z_UM = 1.0 / np.linspace(1 / 80e3, 1 / 400e3, 6)
 
 def pattern(
     z_um: float, *, shift_px: tuple[float, float] = (0.0, 0.0), scale: float = 1.0, noise: float = 1.0
-) -> npt.NDArray[np.float32]:
+) -> Float32Array:
     """An aperture's shadow, 90 x 120 pixels for a source at infinity, filled with bright lines."""
     magnification = scale * (1 + D_UM / z_um)
     rows, columns = (

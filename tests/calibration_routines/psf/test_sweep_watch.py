@@ -18,6 +18,7 @@ from drivers.frame import FrameMetadata
 from instrument.bench.photograph import Snapshot
 from instrument.files.images import read_image
 from instrument.plan import Step
+from recon.arrays import Float64Array
 from recon.evaluation.measured_sets import data_folder
 from recon.types import Geometry
 
@@ -57,7 +58,7 @@ def qualities(events: Sequence[SweepEvent]) -> list[PointTaken]:
     return [event for event in events if isinstance(event, PointTaken)]
 
 
-def spots(peak: float) -> npt.NDArray[np.float64]:
+def spots(peak: float) -> Float64Array:
     """Return soft light with spots of a single pixel in it, the brightest as bright as ``peak``."""
     light = np.zeros(SHAPE)
     light[30:90, 40:120] = 200 * ndimage.gaussian_filter(RNG.random((60, 80)), 2)

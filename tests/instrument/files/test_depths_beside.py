@@ -8,12 +8,12 @@ from typing import Any
 
 import h5py
 import numpy as np
-import numpy.typing as npt
 import pytest
 import scipy.io
 
 from instrument.files.errors import FileError
 from instrument.files.images import ImageFile, read, read_image, read_stack
+from recon.arrays import Array
 
 STACK = np.random.default_rng(0).integers(0, 999, (5, 20, 30)).astype(np.uint16)
 
@@ -48,7 +48,7 @@ def written(folder: Path, suffix: str, **arrays: Any) -> str:
     ],
 )
 def test_depths_that_are_none_are_refused_by_the_arrays_name(
-    tmp_path: Path, suffix: str, name: str, told: npt.NDArray[Any], found: str
+    tmp_path: Path, suffix: str, name: str, told: Array, found: str
 ) -> None:
     if (suffix, told.dtype.kind) in ((".h5", "O"), (".mat", "O"), (".mat", "b")):
         return  # the format has none, or does not tell it from others

@@ -13,12 +13,12 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
-import numpy.typing as npt
 import pytest
 
 from drivers.frame import FrameMetadata
 from instrument.files.errors import FileError, percent
 from instrument.files.record import RecordFormat, plain, value_of
+from recon.arrays import Float64Array
 
 TEA = RecordFormat(
     "test tea",
@@ -153,7 +153,7 @@ class Outer:
     when: datetime
     path: Path
     colour: Colour
-    grid: npt.NDArray[np.float64]
+    grid: Float64Array
     maybe: Inner | None = None
     several: tuple[Inner, ...] = ()
     named: Mapping[str, float] = field(default_factory=dict)

@@ -3,24 +3,23 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
-import numpy.typing as npt
 import pytest
 import tifffile
 from PIL import Image
 
 from instrument.files.errors import FileError
 from instrument.files.images import read_image, read_stack
+from recon.arrays import Array
 
 RNG = np.random.default_rng(3)
 STACK = RNG.integers(0, 4096, (5, 8, 6)).astype(np.uint16)
 PICTURE = STACK[0]
 
 
-def _compressed(path: Path, image: npt.NDArray[Any], **tags: int) -> Path:
+def _compressed(path: Path, image: Array, **tags: int) -> Path:
     """Write a TIFF by LZW, which OpenCV reads, and overwrite tags that its writer knows no other way."""
     Image.fromarray(image).save(path, compression="tiff_lzw")
     with tifffile.TiffFile(path, mode="r+b") as tiff:

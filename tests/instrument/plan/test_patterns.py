@@ -7,7 +7,6 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-import numpy.typing as npt
 import pytest
 
 import instrument.cli.plan  # noqa: F401 - its help lists the patterns that there are when it is imported
@@ -30,6 +29,7 @@ from instrument.plan.patterns import LED_PATTERNS, led_shape, shape_buttons, sha
 from instrument.runs.acquire import abilities_of, acquire
 from instrument.runs.run import Run
 from recon import InputError
+from recon.arrays import BoolArray, Float64Array
 
 BENCH = """
 [bench]
@@ -53,10 +53,8 @@ class Square:
 
     def __post_init__(self) -> None:
         x, y = np.meshgrid(np.arange(-2.0, 3), np.arange(-2.0, 3))
-        self.led_na: npt.NDArray[np.float64] = 0.1 * np.column_stack([x.ravel(), y.ravel()])
-        self.led_positions_mm: npt.NDArray[np.float64] = np.column_stack(
-            [self.led_na * 100, np.full(25, 50.0)]
-        )
+        self.led_na: Float64Array = 0.1 * np.column_stack([x.ravel(), y.ravel()])
+        self.led_positions_mm: Float64Array = np.column_stack([self.led_na * 100, np.full(25, 50.0)])
 
 
 ARRAY = Square()
@@ -195,7 +193,7 @@ class Odd(LedShape):
     name = "odd"
     help = "Every other LED"
 
-    def lit(self, array: LedPlaces) -> npt.NDArray[np.bool_]:
+    def lit(self, array: LedPlaces) -> BoolArray:
         return np.arange(len(array.led_na)) % 2 == 1
 
     @property

@@ -7,7 +7,6 @@ from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
-import numpy.typing as npt
 import pytest
 from scipy import ndimage
 
@@ -16,11 +15,10 @@ from drivers.simulated.world import SimulatedWorld
 from recon.analysis.compare import compare, compare_psfs
 from recon.analysis.pattern_change import Change
 from recon.analysis.what_moved import Seen, moved_across
+from recon.arrays import Float64Array
 from recon.base.blocks import block_mean
 from recon.errors import InputError
 from recon.types import Calibration, Geometry
-
-Floats = npt.NDArray[np.float64]
 
 GREEN = (0.0, 1.0, 0.0)
 DEPTHS_UM = (60e3, 120e3)
@@ -124,7 +122,7 @@ def _first(made: Calibration) -> Calibration:
     ("across", "part"), [(lambda z: 1 + 8900 / z, "diffuser"), (lambda z: 0 * z + 1, "sensor")]
 )
 def test_what_moved_across_is_told_by_how_the_shift_goes_with_depth(
-    across: Callable[[Floats], Floats], part: str
+    across: Callable[[Float64Array], Float64Array], part: str
 ) -> None:
     """And among what it is not known where the shifts are not known well enough."""
     z_um = np.array([60e3, 90e3, 150e3])

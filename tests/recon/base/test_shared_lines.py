@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import numpy as np
-import numpy.typing as npt
 import pytest
 from scipy.signal import fftconvolve
 
 from recon import reconstruct
+from recon.arrays import Float32Array, Float64Array
 from recon.base import shared_lines as module
 from recon.base.blocks import block_mean
 from recon.base.shared_lines import SharedLines, shared_lines
@@ -17,7 +17,6 @@ from recon.reconstruction.options import ReconstructionOptions
 from recon.reconstruction.problem import Problem
 from recon.reconstruction.selection import choose
 
-Image = npt.NDArray[np.float32]
 SHAPE = (96, 128)
 NOISE = 10.0
 
@@ -33,7 +32,7 @@ pairs_are_here = pytest.mark.skipif(
 )
 
 
-def broad_psf() -> Image:
+def broad_psf() -> Float32Array:
     """Return a blurred caustic over much of the sensor."""
     spots = np.random.default_rng(1).random(SHAPE) > 0.98
     y, x = (np.linspace(-1, 1, n) for n in SHAPE)
@@ -41,7 +40,7 @@ def broad_psf() -> Image:
     return np.asarray(np.maximum(psf, 0) * np.exp(-(y[:, None] ** 2 + x**2) / 0.3), np.float32)
 
 
-def photograph(psf: Image) -> Image:
+def photograph(psf: Float32Array) -> Float32Array:
     """Return some things on black through a PSF, with each pixel's noise."""
     scene = np.zeros(SHAPE)
     scene[30:50, 40:44] = scene[60:63, 30:90] = 1
@@ -50,14 +49,14 @@ def photograph(psf: Image) -> Image:
     return np.asarray(light + NOISE * np.random.default_rng(2).standard_normal(SHAPE), np.float32)
 
 
-def of_lines(deviation: float, axis: int, seed: int = 3) -> Image:
+def of_lines(deviation: float, axis: int, seed: int = 3) -> Float32Array:
     """Return an offset for each row (axis 1 is one pixel wide) or column."""
     shape = (SHAPE[0], 1) if axis == 1 else (1, SHAPE[1])
     offsets = np.random.default_rng(seed).normal(0, deviation, shape)
     return np.asarray(np.broadcast_to(offsets, SHAPE), np.float32)
 
 
-def through(scene: npt.NDArray[np.float64], psf: Image, seed: int = 2) -> Image:
+def through(scene: Float64Array, psf: Float32Array, seed: int = 2) -> Float32Array:
     """Return a scene through a PSF, of 2000 electrons a pixel, with their noise."""
     light = np.maximum(fftconvolve(scene, psf, mode="same"), 0)
     light *= 2000 / light.mean()
@@ -66,7 +65,7 @@ def through(scene: npt.NDArray[np.float64], psf: Image, seed: int = 2) -> Image:
     )
 
 
-def found_in(photograph: npt.NDArray[np.float32], psf: npt.NDArray[np.float32]) -> SharedLines | None:
+def found_in(photograph: Float32Array, psf: Float32Array) -> SharedLines | None:
     """Return what is found in a photograph with the noise that is estimated of it."""
     problem = Problem.of(photograph, psf)
     counts = problem.measurement.counts()
@@ -337,7 +336,7 @@ def test_light_may_have_come_through_the_first_depth_or_the_last(count: int) -> 
 def test_no_less_noise_is_taken_than_rounding_makes(monkeypatch: pytest.MonkeyPatch) -> None:
     taken: list[float] = []
 
-    def offsets(image: Image, _valid: object, noise: float, _psfs: object) -> Image:
+    def offsets(image: Float32Array, _valid: object, noise: float, _psfs: object) -> Float32Array:
         taken.append(noise)
         return np.zeros(len(image), np.float32)
 

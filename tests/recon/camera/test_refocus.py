@@ -5,12 +5,12 @@ from __future__ import annotations
 import math
 
 import numpy as np
-import numpy.typing as npt
 import pytest
 
 from drivers.simulated.options import WorldOptions
 from drivers.simulated.world import SimulatedWorld
 from recon.analysis.correlation import across_field, similarity
+from recon.arrays import Float64Array
 from recon.camera.depth_likeness import likeness_range
 from recon.camera.depth_mixture import central_psfs, paraxial_scale
 from recon.camera.grid import FAR_UM
@@ -23,7 +23,6 @@ from recon.types import Calibration, Geometry
 
 WORLD = SimulatedWorld(WorldOptions(preset="tiny", time_scale=0.0))
 GREEN = (0.0, 1.0, 0.0)
-Floats = npt.NDArray[np.float64]
 
 
 def true_psf(z_um: float, x_um: float = 0.0) -> np.ndarray:
@@ -80,10 +79,10 @@ def test_the_expected_similarity_is_that_of_the_truth() -> None:
 def test_what_pairs_leave_open_is_a_range_that_holds_the_truth(power: float) -> None:
     """Pairs of planes by a law that is known; on its plateau they tell little of nearer planes."""
 
-    def law(distance: float | Floats) -> Floats:
+    def law(distance: float | Float64Array) -> Float64Array:
         return 0.99 * (0.9 + 0.1 / (1 + (np.asarray(distance) / 3.0) ** power))
 
-    def between(apart: Floats) -> tuple[float, float, float]:
+    def between(apart: Float64Array) -> tuple[float, float, float]:
         half, gap, shares = np.array([apart[0] / 2] * 2), float(apart[0]), np.array([0.5, 0.5])
         true = float((law(half) * shares).sum() / np.sqrt(0.5 + 0.5 * law(gap)))
         low, high = likeness_range(apart, law(apart), half, shares, gap)

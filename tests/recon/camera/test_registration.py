@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import numpy as np
-import numpy.typing as npt
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from recon.arrays import Float32Array
 from recon.camera.depth_mixture import paraxial_scale
 from recon.camera.registration import aligned, displacement, expected_shift, register, rescaled
 from recon.errors import InputError
@@ -15,7 +15,6 @@ from recon.optics.diffuser import microlens_diffuser, smooth_diffuser
 from recon.optics.grid import GREEN, PixelGrid
 from recon.optics.wave import WavePropagator
 
-Image = npt.NDArray[np.float32]
 D_UM, PITCH_UM = 8900.0, 13.0
 GRID = PixelGrid((240, 320), PITCH_UM)
 LIGHT = GREEN.samples(1)
@@ -26,7 +25,7 @@ def camera() -> WavePropagator:
     return WavePropagator(smooth_diffuser((1500.0, 2000.0), 5.0, seed=3), D_UM)
 
 
-def photograph(camera: WavePropagator, source_um: tuple[float, float, float], seed: int) -> Image:
+def photograph(camera: WavePropagator, source_um: tuple[float, float, float], seed: int) -> Float32Array:
     """Four averaged frames of 20,000 electrons at the 99.9th percentile, read noise 3."""
     light = camera.psf(source_um, GRID, LIGHT)
     electrons = light * np.float32(20_000 / np.quantile(light, 0.999))

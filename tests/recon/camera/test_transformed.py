@@ -9,15 +9,15 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import ndimage
 
+from recon.arrays import Float64Array
 from recon.camera.transformed import Transformation, geometric_centre, resampled, transformed
 from recon.errors import InputError
 
-Image = npt.NDArray[np.float64]
 SHAPE = (60, 81)
 MIDDLE = geometric_centre(np.empty(SHAPE))
 
 
-def spots(places: npt.ArrayLike, width: float) -> Image:
+def spots(places: npt.ArrayLike, width: float) -> Float64Array:
     """Gaussian spots of one unit of light each at (n, 2) places from the centre."""
     y, x = (np.arange(n) - c for n, c in zip(SHAPE, MIDDLE, strict=True))
     image = np.zeros(SHAPE)

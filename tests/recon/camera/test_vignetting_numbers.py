@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 import numpy as np
-import numpy.typing as npt
 import pytest
 
+from recon.arrays import Float64Array
 from recon.camera.vignetting import DEEPEST, ENOUGH, LEAST, NUMBERS, least_squares, shade_of
 
-Floats = npt.NDArray[np.float64]
 SLOPES = np.random.default_rng(3).standard_normal((40, NUMBERS))
 
 
-def never(_: Floats) -> bool:
+def never(_: Float64Array) -> bool:
     return False
 
 
@@ -49,10 +48,10 @@ def test_a_slight_shade_is_found_where_much_speaks_for_it() -> None:
 
 def test_where_nothing_is_gained_it_ends() -> None:
     """A reconstruction each: one try at each damping, at most."""
-    tried: list[Floats] = []
+    tried: list[Float64Array] = []
     unexplained = np.linalg.qr(SLOPES, mode="complete")[0][:, -1] * 30
 
-    def left(numbers: Floats) -> Floats:
+    def left(numbers: Float64Array) -> Float64Array:
         tried.append(numbers)
         return np.asarray(SLOPES @ numbers + unexplained)
 
@@ -66,7 +65,7 @@ def test_it_ends_where_no_more_is_left_than_usual_errors_leave() -> None:
     truth = 0.2 * np.random.default_rng(5).standard_normal(NUMBERS) - 2
     tried: list[float] = []
 
-    def left(numbers: Floats) -> Floats:
+    def left(numbers: Float64Array) -> Float64Array:
         rest = np.asarray(2 * SLOPES @ (numbers - truth) + 0.5)
         tried.append(float(np.mean(rest**2)))
         return rest
@@ -78,9 +77,9 @@ def test_it_ends_where_no_more_is_left_than_usual_errors_leave() -> None:
 
 
 def test_a_step_that_goes_too_far_is_damped_and_so_are_those_after_it() -> None:
-    tried: list[Floats] = []
+    tried: list[Float64Array] = []
 
-    def left(numbers: Floats) -> Floats:
+    def left(numbers: Float64Array) -> Float64Array:
         tried.append(numbers)
         return np.asarray(50 * np.arctan(4 * (np.append(numbers, numbers[0]) - 1.5)))
 
@@ -91,9 +90,9 @@ def test_a_step_that_goes_too_far_is_damped_and_so_are_those_after_it() -> None:
 
 def test_what_comes_to_the_deepest_shade_is_none() -> None:
     wanted = SLOPES @ np.full(NUMBERS, 3.0)
-    seen: list[Floats] = []
+    seen: list[Float64Array] = []
 
-    def is_deepest(numbers: Floats) -> bool:
+    def is_deepest(numbers: Float64Array) -> bool:
         seen.append(numbers)
         return bool(numbers[0] > 1)
 

@@ -8,8 +8,8 @@ source.
 from __future__ import annotations
 
 import numpy as np
-import numpy.typing as npt
 
+from recon.arrays import Float32Array, Float64Array
 from recon.optics.diffuser import Diffuser
 from recon.optics.grid import PixelGrid, Spectrum
 from recon.optics.jit import compiled
@@ -40,7 +40,7 @@ class RayPropagator(WavePropagator):
         *,
         diameter_um: float = 0.0,
         emission: Emission = "lambertian",
-    ) -> npt.NDArray[np.float32]:
+    ) -> Float32Array:
         """Light of a point source on the pixels of a sensor grid."""
         check_source(source_um)
         light = np.zeros(grid.shape)
@@ -70,12 +70,12 @@ class RayPropagator(WavePropagator):
 
 @compiled
 def _trace(  # noqa: PLR0913 - compiled
-    light: npt.NDArray[np.float64],
+    light: Float64Array,
     top: float,
     left: float,
     pixel: float,
-    slopes_y: npt.NDArray[np.float32],
-    slopes_x: npt.NDArray[np.float32],
+    slopes_y: Float32Array,
+    slopes_x: Float32Array,
     pitch: float,
     aperture_y: float,
     aperture_x: float,

@@ -5,10 +5,10 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-import numpy.typing as npt
 import pytest
 from scipy import stats
 
+from recon.arrays import Float64Array
 from recon.base.blocks import block_sum
 from recon.optics.sensor import FixedPattern, Readout, SensorSpec, expose, fixed_pattern
 
@@ -44,7 +44,7 @@ def uniform(dark_e_per_s: float = 0.0, response: float = 1.0) -> FixedPattern:
 
 def frame(
     electrons_per_s: float, exposure_s: float, readout: Readout = READOUT, seed: int = 0, dark: float = 0.0
-) -> npt.NDArray[np.float64]:
+) -> Float64Array:
     light = np.full(SHAPE, electrons_per_s, np.float32)
     return expose(light, uniform(dark), exposure_s, readout, seed).astype(np.float64)
 

@@ -5,9 +5,9 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-import numpy.typing as npt
 import pytest
 
+from recon.arrays import Float32Array, Float64Array
 from recon.optics.diffuser import AIR, Diffuser, Glass, microlens_diffuser, smooth_diffuser
 from recon.optics.grid import GREEN, PixelGrid, mixed_spectrum
 from recon.optics.wave import WavePropagator
@@ -28,18 +28,18 @@ def propagator(diffuser: Diffuser) -> WavePropagator:
     return WavePropagator(diffuser, DISTANCE_UM)
 
 
-def centroid(image: npt.NDArray[np.float32], grid: PixelGrid) -> npt.NDArray[np.float64]:
+def centroid(image: Float32Array, grid: PixelGrid) -> Float64Array:
     total = image.sum(dtype=np.float64)
     return np.array([(image.sum(axis=0) * grid.x_um).sum(), (image.sum(axis=1) * grid.y_um).sum()]) / total
 
 
-def similarity(first: npt.NDArray[np.float32], second: npt.NDArray[np.float32]) -> float:
+def similarity(first: Float32Array, second: Float32Array) -> float:
     return float((first * second).sum() / np.linalg.norm(first) / np.linalg.norm(second))
 
 
 def registered(
     propagator: WavePropagator, source_um: tuple[float, float, float], grid: PixelGrid
-) -> npt.NDArray[np.float32]:
+) -> Float32Array:
     """PSF on a grid about the straight ray through the aperture's centre."""
     x, y, z = source_um
     shift = propagator.distance_um / z

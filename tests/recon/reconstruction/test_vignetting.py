@@ -5,10 +5,10 @@ from __future__ import annotations
 import json
 
 import numpy as np
-import numpy.typing as npt
 import pytest
 
 from recon import reconstruct
+from recon.arrays import Float32Array
 from recon.base.blocks import block_mean
 from recon.base.noise import NoiseModel
 from recon.camera.vignetting import shade_of
@@ -25,7 +25,6 @@ from recon.reconstruction.uncertainty import Replicas
 from recon.streams.live import LiveReconstructor
 from recon.types import Calibration
 
-Image = npt.NDArray[np.float32]
 BINNING = 16
 
 measured = pytest.mark.skipif(
@@ -34,13 +33,13 @@ measured = pytest.mark.skipif(
 
 
 @pytest.fixture(scope="module")
-def hand() -> tuple[Image, Image]:
+def hand() -> tuple[Float32Array, Float32Array]:
     """The measured hand and its PSF, binned."""
     psfs, photograph = measured_set("hand")
     return block_mean(photograph, BINNING), block_mean(psfs[0], BINNING)
 
 
-def cos4(shape: tuple[int, int], corner: float) -> Image:
+def cos4(shape: tuple[int, int], corner: float) -> Float32Array:
     """Return light that falls off round about the middle, to so much in the corners."""
     y, x = ((np.arange(n) - (n - 1) / 2) for n in shape)
     r2 = (y[:, None] ** 2 + x**2) / (y[0] ** 2 + x[0] ** 2)
@@ -49,7 +48,9 @@ def cos4(shape: tuple[int, int], corner: float) -> Image:
 
 @measured
 @pytest.mark.parametrize("corner", [0.3, 0.6])
-def test_the_shade_of_a_measured_photograph_is_found(hand: tuple[Image, Image], corner: float) -> None:
+def test_the_shade_of_a_measured_photograph_is_found(
+    hand: tuple[Float32Array, Float32Array], corner: float
+) -> None:
     photograph, psf = hand
     shade = cos4(photograph.shape, corner)
     restored = with_light_restored(Problem.of(photograph * shade, psf))
@@ -77,7 +78,7 @@ def test_a_psf_that_stands_on_an_offset_shades_no_photograph() -> None:
 
 
 @measured
-def test_a_shaded_photograph_is_as_good_as_one_that_is_not(hand: tuple[Image, Image]) -> None:
+def test_a_shaded_photograph_is_as_good_as_one_that_is_not(hand: tuple[Float32Array, Float32Array]) -> None:
     photograph, psf = hand
     clear = reconstruct(photograph, psf, judged=False).image
     shaded = reconstruct(photograph * cos4(photograph.shape, 0.5), psf, judged=False).image
@@ -85,7 +86,7 @@ def test_a_shaded_photograph_is_as_good_as_one_that_is_not(hand: tuple[Image, Im
 
 
 @measured
-def test_what_is_clear_or_lost_its_dark_level_is_not_shaded(hand: tuple[Image, Image]) -> None:
+def test_what_is_clear_or_lost_its_dark_level_is_not_shaded(hand: tuple[Float32Array, Float32Array]) -> None:
     photograph, psf = hand
     for taken_off in (0.0, 0.14):
         restored = with_light_restored(
@@ -95,7 +96,7 @@ def test_what_is_clear_or_lost_its_dark_level_is_not_shaded(hand: tuple[Image, I
 
 
 @measured
-def test_stray_light_is_a_background_and_no_shade(hand: tuple[Image, Image]) -> None:
+def test_stray_light_is_a_background_and_no_shade(hand: tuple[Float32Array, Float32Array]) -> None:
     photograph, psf = hand
     y, x = (np.linspace(-1, 1, n) for n in photograph.shape)
     hill = np.exp(-((y[:, None] - 0.3) ** 2 + (x + 0.4) ** 2) / 0.3)
@@ -106,7 +107,9 @@ def test_stray_light_is_a_background_and_no_shade(hand: tuple[Image, Image]) -> 
 
 
 @measured
-def test_a_film_is_told_of_no_shade_that_its_frames_do_not_get(hand: tuple[Image, Image]) -> None:
+def test_a_film_is_told_of_no_shade_that_its_frames_do_not_get(
+    hand: tuple[Float32Array, Float32Array],
+) -> None:
     photograph, psf = hand
     shaded = Problem.of(
         photograph * cos4(photograph.shape, 0.5), psf, ReconstructionOptions(model="convolution")
@@ -156,7 +159,7 @@ def test_a_shade_is_brightest_where_it_is_1_and_the_same_on_coarser_pixels() -> 
 
 
 @measured
-def test_a_shade_and_stray_light_are_both_found(hand: tuple[Image, Image]) -> None:
+def test_a_shade_and_stray_light_are_both_found(hand: tuple[Float32Array, Float32Array]) -> None:
     photograph, psf = hand
     lit = photograph * cos4(photograph.shape, 0.25) + np.float32(0.3 * photograph.mean())
     chosen = choose(Problem.of(lit, psf))
@@ -165,7 +168,7 @@ def test_a_shade_and_stray_light_are_both_found(hand: tuple[Image, Image]) -> No
 
 
 @measured
-def test_numbers_of_a_shade_are_recorded_and_make_it_again(hand: tuple[Image, Image]) -> None:
+def test_numbers_of_a_shade_are_recorded_and_make_it_again(hand: tuple[Float32Array, Float32Array]) -> None:
     photograph, psf = hand
     restored = with_light_restored(Problem.of(photograph * cos4(photograph.shape, 0.4), psf))
     found = json.loads(json.dumps(restored.provenance()))["fitted_to_the_photograph"]

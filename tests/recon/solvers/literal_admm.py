@@ -9,8 +9,9 @@ from typing import ClassVar
 
 import numpy as np
 
+from recon.arrays import Array
 from recon.base import fft
-from recon.camera.base import Array, LinearOperator
+from recon.camera.base import LinearOperator
 from recon.camera.convolution import Convolution
 from recon.camera.factors import as_cropped_convolution
 from recon.priors.base import Prior

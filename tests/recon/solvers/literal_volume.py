@@ -12,10 +12,9 @@ from __future__ import annotations
 from typing import ClassVar
 
 import numpy as np
-import numpy.typing as npt
 
+from recon.arrays import Array, Float64Array
 from recon.base import fft
-from recon.camera.base import Array
 from recon.camera.convolution import Convolution
 from recon.solvers.base import IterationRecord, Solver
 
@@ -63,7 +62,7 @@ class LiteralAdmm(Solver):
         self.axis_weights = axis_weights
         self.balance = balance
         self.balance_every = balance_every
-        self.mu: npt.NDArray[np.float64] = np.array(penalties, np.float64)
+        self.mu: Float64Array = np.array(penalties, np.float64)
         dtype = operator.dtype
         self.shape = operator.domain_shape[1:]
         self.window = (0, *operator.sensor_window)

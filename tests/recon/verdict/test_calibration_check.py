@@ -7,11 +7,11 @@ from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
-import numpy.typing as npt
 import pytest
 from scipy.ndimage import gaussian_filter
 
 from recon import Calibration, Geometry, reconstruct
+from recon.arrays import Float32Array
 from recon.base.blocks import block_mean
 from recon.camera.transformed import Transformation, transformed
 from recon.errors import InputError
@@ -43,13 +43,12 @@ from recon.verdict.coded import Coded, coded
 from recon.verdict.judge import Region, Verdict
 from tests.golden import inputs
 
-Image = npt.NDArray[np.float32]
 GRID = PixelGrid((96, 96), 13.0)
 D_UM, Z_UM = 8900.0, 150e3
 
 
 @pytest.fixture(scope="module")
-def seen() -> tuple[Image, Image]:
+def seen() -> tuple[Float32Array, Float32Array]:
     """A photograph of bars and the PSF, by propagation, with shot and read noise."""
     rng = np.random.default_rng(1)
     optics = WavePropagator(smooth_diffuser((880.0, 880.0), 5.0, seed=1), D_UM)
@@ -64,13 +63,13 @@ def seen() -> tuple[Image, Image]:
     return noisy[0].astype(np.float32), noisy[1].astype(np.float32)
 
 
-def fit(photograph: Image, psf: Image) -> tuple[Fit, str]:
+def fit(photograph: Float32Array, psf: Float32Array) -> tuple[Fit, str]:
     check = check_calibration(Problem.of(photograph, psf))
     assert check is not None
     return check.fit, str(check.better)
 
 
-def test_a_right_calibration_fits(seen: tuple[Image, Image]) -> None:
+def test_a_right_calibration_fits(seen: tuple[Float32Array, Float32Array]) -> None:
     assert fit(*seen)[0] is Fit.FITS
     moved = transformed(seen[1], Transformation(5, -3))
     assert fit(seen[0], moved)[0] is Fit.FITS  # the picture is displaced, and nobody can tell
@@ -86,12 +85,12 @@ def test_a_right_calibration_fits(seen: tuple[Image, Image]) -> None:
     ],
 )
 def test_what_became_of_a_wrong_one_is_named(
-    seen: tuple[Image, Image], how: Transformation, found: str
+    seen: tuple[Float32Array, Float32Array], how: Transformation, found: str
 ) -> None:
     assert fit(seen[0], transformed(seen[1], how)) == (Fit.OFF, found)
 
 
-def test_another_diffusers_is_foreign_and_never_reliable(seen: tuple[Image, Image]) -> None:
+def test_another_diffusers_is_foreign_and_never_reliable(seen: tuple[Float32Array, Float32Array]) -> None:
     optics = WavePropagator(smooth_diffuser((880.0, 880.0), 5.0, seed=2), D_UM)
     other = optics.psf((0.0, 0.0, Z_UM), GRID, GREEN.samples(1))
     result = reconstruct(seen[0], other, iterations=20)
@@ -101,14 +100,14 @@ def test_another_diffusers_is_foreign_and_never_reliable(seen: tuple[Image, Imag
     assert first.startswith("not reliable: the calibration does not")
 
 
-def test_where_nothing_is_lit_or_all_is_nothing_is_told(seen: tuple[Image, Image]) -> None:
+def test_where_nothing_is_lit_or_all_is_nothing_is_told(seen: tuple[Float32Array, Float32Array]) -> None:
     for wall in (1000, 4000):
         noise = np.random.default_rng(3).normal(wall, 30, seen[0].shape).astype(np.float32)
         assert fit(noise, seen[1])[0] is Fit.UNTOLD
 
 
 def test_a_photograph_mostly_at_full_scale_has_its_noise_and_accuses_nobody(
-    seen: tuple[Image, Image], monkeypatch: pytest.MonkeyPatch
+    seen: tuple[Float32Array, Float32Array], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     clipped = np.minimum(seen[0], np.percentile(seen[0], 40))
     assert Problem.of(clipped, seen[1]).noise[0] > 0.3 * Problem.of(*seen).noise[0]
@@ -129,7 +128,7 @@ def test_a_photograph_mostly_at_full_scale_has_its_noise_and_accuses_nobody(
 
 @pytest.mark.parametrize("said", decoys.CONTRADICTIONS)
 def test_what_contradicts_itself_is_not_told(
-    seen: tuple[Image, Image], monkeypatch: pytest.MonkeyPatch, said: tuple[Fit, Fit]
+    seen: tuple[Float32Array, Float32Array], monkeypatch: pytest.MonkeyPatch, said: tuple[Fit, Fit]
 ) -> None:
     unsure = GOOD | dict.fromkeys(NEAR, GOOD[GIVEN])  # else the first would do
     told = iter([CalibrationCheck(fit, unsure, 9000, NEAR[0]) for fit in said])
@@ -138,7 +137,7 @@ def test_what_contradicts_itself_is_not_told(
 
 
 def test_a_saturated_psf_is_named_as_what_does_not_fit(
-    seen: tuple[Image, Image], monkeypatch: pytest.MonkeyPatch
+    seen: tuple[Float32Array, Float32Array], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     unsure = dict.fromkeys((GIVEN, *NEAR, *FAR), GOOD[GIVEN])
     clipped = np.minimum(seen[1], np.percentile(seen[1], 95))
@@ -152,7 +151,7 @@ def test_a_saturated_psf_is_named_as_what_does_not_fit(
 
 @pytest.mark.parametrize("both", [False, True])
 def test_files_that_are_not_in_proportion_to_the_light_are_named(
-    seen: tuple[Image, Image], monkeypatch: pytest.MonkeyPatch, both: bool
+    seen: tuple[Float32Array, Float32Array], monkeypatch: pytest.MonkeyPatch, both: bool
 ) -> None:
     unsure = dict.fromkeys((GIVEN, *NEAR, *FAR), GOOD[GIVEN]) | {NEAR[0]: BETTER}
     monkeypatch.setattr(decoys, "_competition", lambda *_: CalibrationCheck(Fit.OFF, unsure, 9000, NEAR[0]))
@@ -186,7 +185,7 @@ def test_noise_thought_to_be_less_than_it_is_makes_nobody_foreign() -> None:
     assert check_of(noisy, 9000, structure=0.5).fit is Fit.FOREIGN
 
 
-def test_of_a_picture_with_a_background(seen: tuple[Image, Image]) -> None:
+def test_of_a_picture_with_a_background(seen: tuple[Float32Array, Float32Array]) -> None:
     stray = np.random.default_rng(4).poisson(2 * seen[0].mean() * np.linspace(0.7, 1.3, 96), (96, 96))
     problem = Problem.of(seen[0] + stray.astype(np.float32), seen[1], Options(estimate_background=True))
     found = pilot(problem, 10)
@@ -209,7 +208,11 @@ def test_of_a_picture_with_a_background(seen: tuple[Image, Image]) -> None:
     ],
 )
 def test_an_accused_one_is_cleared_against_its_accuser_wherever_that_was_tried(
-    seen: tuple[Image, Image], monkeypatch: pytest.MonkeyPatch, gain: float, scale: float, found: Fit
+    seen: tuple[Float32Array, Float32Array],
+    monkeypatch: pytest.MonkeyPatch,
+    gain: float,
+    scale: float,
+    found: Fit,
 ) -> None:
     on_the_way, right = Transformation(scale=scale), GOOD[GIVEN]
     accused = CalibrationCheck(Fit.OFF, GOOD, 9000, on_the_way)
@@ -220,7 +223,7 @@ def test_an_accused_one_is_cleared_against_its_accuser_wherever_that_was_tried(
     assert fit(*seen)[0] is found
 
 
-def test_volumes_are_told_by_turns(seen: tuple[Image, Image]) -> None:
+def test_volumes_are_told_by_turns(seen: tuple[Float32Array, Float32Array]) -> None:
     psfs = np.stack([seen[1], transformed(seen[1], Transformation(scale=1.1))])[:, None]
     depths = Calibration(psfs, np.array([[0.0, 0.0, Z_UM], [0.0, 0.0, 0.6 * Z_UM]]))
     right = check_calibration(Problem.of(seen[0], depths))
@@ -267,7 +270,7 @@ GOOD = {GIVEN: score(1.2, 1.5), BETWEEN: score(1.2, 1.5)} | {how: score(1.6, 2.0
     ],
 )
 def test_where_far_more_than_noise_is_left_it_sets_the_priors_weight(
-    seen: tuple[Image, Image],
+    seen: tuple[Float32Array, Float32Array],
     monkeypatch: pytest.MonkeyPatch,
     first: Fit,
     heavier: Fit,
@@ -323,7 +326,7 @@ def test_a_pattern_that_is_half_its_own_mirror_image_is_not_foreign() -> None:
 
 
 def test_on_the_same_pixels_more_iterations_tell_who_is_foreign(
-    seen: tuple[Image, Image], monkeypatch: pytest.MonkeyPatch
+    seen: tuple[Float32Array, Float32Array], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     unsure = dict.fromkeys((GIVEN, *NEAR, *FAR), GOOD[GIVEN])
     told = iter([CalibrationCheck(f, unsure, 9000) for f in (Fit.FOREIGN, Fit.UNTOLD)])
@@ -348,7 +351,9 @@ def test_an_untold_calibration_is_doubtful_at_best() -> None:
     )
 
 
-def test_swapped_and_identical_images_are_refused_before_the_work(seen: tuple[Image, Image]) -> None:
+def test_swapped_and_identical_images_are_refused_before_the_work(
+    seen: tuple[Float32Array, Float32Array],
+) -> None:
     photograph, psf = seen
     with pytest.raises(InputError, match="seem to be swapped"):
         reconstruct(psf, photograph)
@@ -368,7 +373,7 @@ def test_where_the_better_copy_explains_little_more_it_may_be_anothers(misfit: f
     assert ("another diffuser's" in what_to_do) is said
 
 
-def coded_for_the_eye(image: Image) -> Image:
+def coded_for_the_eye(image: Float32Array) -> Float32Array:
     """Return 8 bit such as a camera writes for the eye, binned, less their darkest."""
     coded = block_mean(np.round(255 * (np.maximum(image, 0) / image.max()) ** (1 / 2.2)), 8)
     return np.asarray(coded - coded.min(), np.float32)
@@ -413,7 +418,7 @@ def test_a_psf_alone_is_not_called_coded_as_a_power_takes_a_pedestal_too() -> No
     photograph, psfs = np.eye(4, dtype=np.float32), np.full((1, 1, 4, 4), 0.5, np.float32)
     psfs[..., 0, 0] = 1
 
-    def left(seen: Image, response: Image) -> float:
+    def left(seen: Float32Array, response: Float32Array) -> float:
         return 0.1 if seen is photograph and response is not psfs else 0.3
 
     assert coded(photograph, psfs, left, asked=True) is None
@@ -421,7 +426,7 @@ def test_a_psf_alone_is_not_called_coded_as_a_power_takes_a_pedestal_too() -> No
 
 @pytest.mark.parametrize("n_depths", [1, 2])
 def test_a_volume_is_offered_what_straightens_its_files(
-    seen: tuple[Image, Image], monkeypatch: pytest.MonkeyPatch, n_depths: int
+    seen: tuple[Float32Array, Float32Array], monkeypatch: pytest.MonkeyPatch, n_depths: int
 ) -> None:
     photograph, psf = seen
     psfs = np.stack([psf, transformed(psf, Transformation(scale=1.2))])[:n_depths, None]
@@ -439,7 +444,7 @@ def test_a_volume_is_offered_what_straightens_its_files(
 
 @pytest.mark.parametrize(("pixels", "explained"), [(100, True), (160, False)])
 def test_what_is_left_is_held_against_the_contrast_of_the_same_pixels(
-    seen: tuple[Image, Image], monkeypatch: pytest.MonkeyPatch, pixels: int, explained: bool
+    seen: tuple[Float32Array, Float32Array], monkeypatch: pytest.MonkeyPatch, pixels: int, explained: bool
 ) -> None:
     """Larger pixels have less noise, so that the same contrast is more of it there."""
 
