@@ -34,6 +34,7 @@ from __future__ import annotations
 
 import argparse
 import re
+import sys
 import tempfile
 import time
 from collections import Counter
@@ -45,6 +46,8 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from benchmarks.display_learning import configuration
 from calibration_routines.display.display_io import DisplayBench, require_slm

@@ -23,6 +23,8 @@ import time
 from pathlib import Path
 from types import SimpleNamespace
 
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+
 from benchmarks.display_learning import configuration
 from calibration_routines import rehearsal
 from calibration_routines.routine import routines

@@ -218,6 +218,18 @@ def test_what_benchmarks_import_is_there() -> None:
     assert count > 300
 
 
+def test_benchmarks_that_are_programs_find_what_lies_beside_them() -> None:
+    """Without PYTHONPATH; those that are imported by one find it by that one."""
+    lost = []
+    for path in (ROOT / "benchmarks").glob("*.py"):
+        text = path.read_text("utf-8")
+        beside = re.search(r"^from (benchmarks|tests)\b", text, re.M)
+        made = re.search(r"^sys\.path\.", text, re.M)
+        if beside and "__main__" in text and not (made and made.start() < beside.start()):
+            lost.append(path.name)
+    assert lost == []
+
+
 DECISIONS = ROOT / "docs" / "decisions"
 HOLD = re.compile(r"\* \[(\d{4})\]\((\S+)\) (?:~~)?(.*?)(?:~~)?(?: \((?:in part )?now (.*)\))?")
 """A line of the index: a decision, its heading, and what replaced it or parts of it."""
