@@ -19,10 +19,6 @@ from recon.base.namespace import Namespace, to_host
 EXACT_MODES = 18
 """Lowest cosine modes per axis that are inverted together: their matrix has 324 rows."""
 
-FEWER_MODES, FEWER_BELOW_PX = 12, 128
-"""As many do for pictures without a background on a sensor of so few pixels along its longer side, where 18
-took a quarter of the time: such are the copies on which calibrations are judged."""
-
 BANDWIDTH = 4
 """Frequencies up to this multiple of the highest exact mode's are summed for their matrix."""
 
@@ -44,8 +40,6 @@ class CosinePreconditioner:
     dtype : dtype
     xp : module
         Whose arrays: ``numpy`` or ``cupy``.
-    exact : int, optional
-        Modes per axis that are inverted together, default :data:`EXACT_MODES`.
     """
 
     def __init__(
@@ -54,11 +48,10 @@ class CosinePreconditioner:
         sensor_shape: tuple[int, int],
         dtype: npt.DTypeLike,
         xp: Namespace = np,
-        exact: int | None = None,
     ) -> None:
         self._xp, self._shapes = xp, (grid_shape, sensor_shape)
         self._modes: Array = xp.empty(sensor_shape, dtype)
-        self._low = _LowModes(grid_shape, sensor_shape, exact or EXACT_MODES)
+        self._low = _LowModes(grid_shape, sensor_shape)
         self._weights = np.ones(self._low.counts)
         self._symbol: Array = xp.zeros((1, 1), dtype)
         self._near: Array = np.zeros((self._low.size, self._low.size))
@@ -120,21 +113,10 @@ class PicturePreconditioner(CosinePreconditioner):
     power : ndarray, (grid_height, grid_width // 2 + 1)
         ``|H|^2`` of the camera's transfer function.
     grid_shape, sensor_shape : (int, int)
-    background : bool
-        Whether a smooth background is estimated as well: its modes are among those inverted together.
     """
 
-    def __init__(
-        self,
-        power: Array,
-        grid_shape: tuple[int, int],
-        sensor_shape: tuple[int, int],
-        *,
-        background: bool = False,
-    ) -> None:
-        fewer = not background and max(sensor_shape) <= FEWER_BELOW_PX
-        exact = min(EXACT_MODES, FEWER_MODES) if fewer else EXACT_MODES
-        super().__init__(grid_shape, sensor_shape, power.dtype, exact=exact)
+    def __init__(self, power: Array, grid_shape: tuple[int, int], sensor_shape: tuple[int, int]) -> None:
+        super().__init__(grid_shape, sensor_shape, power.dtype)
         self._symbol = _cosine_symbol(power, grid_shape, sensor_shape)
         rows, columns = (laplacian_eigenvalues(2 * n)[:n] for n in sensor_shape)
         self._laplacian = (rows[:, None] + columns[None]).astype(power.dtype)
@@ -183,8 +165,8 @@ def _lags(n: int, grid: int) -> tuple[Array, Array]:
 class _LowModes:
     """The matrix of ``C q C^T`` between the lowest cosine modes, summed over the frequencies near them."""
 
-    def __init__(self, grid_shape: tuple[int, int], sensor_shape: tuple[int, int], most: int) -> None:
-        self.counts = (min(most, sensor_shape[0]), min(most, sensor_shape[1]))
+    def __init__(self, grid_shape: tuple[int, int], sensor_shape: tuple[int, int]) -> None:
+        self.counts = (min(EXACT_MODES, sensor_shape[0]), min(EXACT_MODES, sensor_shape[1]))
         self.size = self.counts[0] * self.counts[1]
         (rows, fy), (columns, fx) = (
             _mode_pairs(*args) for args in zip(self.counts, sensor_shape, grid_shape, strict=True)

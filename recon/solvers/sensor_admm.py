@@ -139,10 +139,7 @@ class SensorAdmm(PictureSplitting):
         self._row_sums = np.zeros(grid[0])
         power = camera.power()
         self._preconditioners = [
-            PicturePreconditioner(
-                power[c % len(power)], grid, camera.sensor_shape, background=background is not None
-            )
-            for c in range(len(start))
+            PicturePreconditioner(power[c % len(power)], grid, camera.sensor_shape) for c in range(len(start))
         ]
         # What the first guess of the penalties needs to know of each channel's |H|^2.
         self._mean_power = power.mean(axis=(1, 2), dtype=np.float64)

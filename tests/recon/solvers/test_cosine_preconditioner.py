@@ -9,8 +9,6 @@ from scipy.fft import dctn, idctn
 from recon.camera.convolution import Convolution
 from recon.solvers.cosine_preconditioner import (
     EXACT_MODES,
-    FEWER_BELOW_PX,
-    FEWER_MODES,
     CosinePreconditioner,
     PicturePreconditioner,
     laplacian_eigenvalues,
@@ -90,7 +88,6 @@ def test_beyond_the_lowest_modes_it_is_chans_diagonal_and_among_them_the_inverse
     psf: tuple[int, int], kind: str
 ) -> None:
     sensor = (EXACT_MODES + 2, EXACT_MODES + 7)
-    exact = EXACT_MODES if kind == "curvature" else FEWER_MODES
     camera, power, matrix = seen(sensor, psf)
     preconditioner = made(kind, camera)
     # The autocorrelation times the overlap of the sensor with itself shifted, seen by each mode's cosine: of
@@ -112,32 +109,15 @@ def test_beyond_the_lowest_modes_it_is_chans_diagonal_and_among_them_the_inverse
     gain = 1 / (1 + symbol) if kind == "curvature" else restraint / (restraint + symbol)
     found = np.array([
         dctn(preconditioner.apply(idctn(mode, norm="ortho"), np.empty(sensor)), norm="ortho")[at]
-        for at in np.ndindex(sensor) if max(at) >= exact
+        for at in np.ndindex(sensor) if max(at) >= EXACT_MODES
         for mode in [(np.indices(sensor) == np.array(at)[:, None, None]).all(axis=0).astype(float)]
     ])  # fmt: skip
-    expected = [gain[at] for at in np.ndindex(sensor) if max(at) >= exact]
+    expected = [gain[at] for at in np.ndindex(sensor) if max(at) >= EXACT_MODES]
     np.testing.assert_allclose(found, expected, atol=1e-9)
     n = matrix.shape[0]
     basis = dctn(np.eye(n).reshape(n, *sensor), axes=(1, 2), norm="ortho").reshape(n, n)
-    low = (np.indices(sensor).max(axis=0) < exact).ravel()
+    low = (np.indices(sensor).max(axis=0) < EXACT_MODES).ravel()
     within = (basis.T @ matrix @ basis)[np.ix_(low, low)]
     inverse = np.linalg.inv(np.eye(len(within)) + within)
     own = (basis.T @ applied(preconditioner, sensor) @ basis)[np.ix_(low, low)]
     np.testing.assert_allclose(own, inverse, atol=1e-9)
-
-
-@pytest.mark.parametrize(
-    ("side", "background", "exact"),
-    [
-        (FEWER_BELOW_PX, False, FEWER_MODES),
-        (FEWER_BELOW_PX + 1, False, EXACT_MODES),
-        (32, True, EXACT_MODES),
-    ],
-)
-def test_small_pictures_without_a_background_invert_fewer_modes(
-    side: int, background: bool, exact: int
-) -> None:
-    shape, grid = (24, side), (48, 2 * side)
-    power = np.ones((grid[0], grid[1] // 2 + 1))
-    made = PicturePreconditioner(power, grid, shape, background=background)
-    assert made._low.counts == (exact, exact)
