@@ -30,7 +30,7 @@ PACE: dict[str, Any] = {"budget_ms": 1e6, "coarsest": 1}
 CASES: dict[str, tuple[dict[str, Any], float]] = {
     "one PSF": ({"model": "convolution"}, 0.04),
     "one PSF, erasures": ({"model": "convolution", "erased": True}, 0.04),
-    "l1, erasures": ({"prior": "l1", "model": "convolution", "erased": True}, 0.08),
+    "l1, erasures": ({"prior": "l1", "model": "convolution", "erased": True}, 0.04),
     "local": ({"model": "local"}, 0.06),
     "low rank, l1, erasures": ({"model": "lowrank", "prior": "l1", "erased": True}, 0.04),
     "smooth background, erasures": ({"estimate_background": True, "erased": True}, 0.06),
