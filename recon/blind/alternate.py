@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from recon.arrays import Array, Float32Array, Float64Array
+from recon.base.threads import linear_algebra_on_one_thread
 from recon.blind.made_up import alike_by_halves
 from recon.blind.polish import first_psf, offset_of, polish
 from recon.blind.psf_step import BeadMixer, refuse_what_is_no_beads, solve_psfs
@@ -122,6 +123,7 @@ class BlindResult:
         return result
 
 
+@linear_algebra_on_one_thread()
 def calibrate_from_beads(
     images: Array,
     psf_shape: tuple[int, int],
