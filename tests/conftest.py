@@ -6,12 +6,14 @@ change is about that change. Everywhere else they look for new ones.
 
 from __future__ import annotations
 
+import fcntl
 import os
 import signal
 import threading
 import time
 import zlib
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
 
 # A window that matplotlib opens beside the program's own would wait for somebody to close it.
@@ -49,6 +51,32 @@ except ImportError:
     pass  # tests/gui says so, test by test
 else:
     pytest_plugins = ["pytestqt.plugin"]
+
+
+def _compile_once_for_all_workers() -> None:
+    """Let one worker compile a kernel while others that want it wait, and take it from numba's cache.
+
+    Else each compiles it, and one of two that write into an index at a time loses its part. Threads
+    wait before processes, and kernels do not call each other in circles: nobody waits for ever.
+    """
+    from numba.core.compiler_lock import global_compiler_lock
+    from numba.core.dispatcher import Dispatcher
+
+    compiled = Dispatcher.compile
+
+    def compiled_once(self: Any, signature: Any) -> Any:
+        if (folder := self._cache.cache_path) is None:
+            return compiled(self, signature)
+        Path(folder).mkdir(parents=True, exist_ok=True)
+        with global_compiler_lock, Path(folder, f"{self.py_func.__qualname__}.lock").open("w") as lock:
+            fcntl.flock(lock, fcntl.LOCK_EX)
+            return compiled(self, signature)
+
+    Dispatcher.compile = compiled_once  # type: ignore[assignment, method-assign]
+
+
+if "PYTEST_XDIST_WORKER" in os.environ:
+    _compile_once_for_all_workers()
 
 
 def _begin_random_numbers(module: object, name: str) -> None:
