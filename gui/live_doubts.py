@@ -22,8 +22,8 @@ class LiveDoubts:
         self._session = session
 
     def of(self, result: LiveResult, depth_words: str) -> str:
-        """Return what is doubtful by a picture's pixels, or its depth, and by what its frame was."""
-        of_pixels = result.picture.doubt
+        """Return what is doubtful, or not known yet, by a picture's pixels, its depth, and its frame."""
+        of_pixels = result.picture.said
         if of_pixels and self._session.lights.during(result.metadata) == NOTHING_LIT:
             return of_pixels  # which says it
         said = ". ".join(filter(None, (self.of_frame(result.metadata), depth_words or of_pixels)))

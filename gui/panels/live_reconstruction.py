@@ -362,7 +362,7 @@ class LiveReconstructionPanel(Panel):
             self.view.caution_against(self._doubts.of(result, self._seeker.words))
         self.view.set_caption(self._caption(result.metadata))
         # What is doubted stands over the picture.
-        worth = result.picture.quality.removeprefix(result.picture.doubt).removeprefix(": ")
+        worth = result.picture.quality.removeprefix(result.picture.said).removeprefix(": ")
         late = (
             f"{result.latency_ms:.0f} ms" if result.latency_ms < 1000 else f"{result.latency_ms / 1e3:.2f} s"
         )

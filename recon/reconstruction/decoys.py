@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from itertools import count
+from functools import cache
 
 import numpy as np
 
@@ -67,9 +67,14 @@ HEAVIER = {Fit.UNTOLD: (Fit.FITS, Fit.OFF), Fit.FOREIGN: (Fit.OFF,)}
 MOVED_DEG, MOVED_SCALE = 6.0, 0.05
 """Turn, such as can be fitted, and change of size up to which a calibration is taken for the own one that
 moved: another diffuser's is "8 % smaller" or 11 by chance."""
-DECOYS, MOST_DECOYS = 8, 12
-"""Usually; and with farther ones on the side of a near one that is better, each twice as far: to some eight
-degrees or per cent."""
+MOST_DECOYS = 12
+"""With farther ones on the side of a near one that is better, each twice as far: to some eight degrees or per
+cent. Usually there are eight."""
+TRIES, NEARLY_ALL = 60, 0.95
+"""Of the quick way, about as many as it takes where they do not clear the calibration; and the share of it
+that is told where it takes more."""
+AMONG = "judging: the calibration among its decoys"
+"""The stage of a check that has found nothing yet."""
 ALIKE = 0.7
 """Likeness from which a far decoy tells nothing, as of regular lenslets, which are their own mirror image."""
 PART = 0.5
@@ -124,15 +129,20 @@ def fitting_depth(problem: Problem, now: int) -> int:
 
 
 def _checked(problem: Problem, on_stage: Stage | None) -> CalibrationCheck | None:
-    done = count(1)
+    done, words = 0, AMONG
 
-    def compete(small: _Small, iterations: int, *, lit: bool, weight: float = WEIGHT) -> CalibrationCheck:
+    def scoring(
+        small: _Small, iterations: int, *, lit: bool, weight: float = WEIGHT
+    ) -> Callable[[Transformation], Score]:
+        @cache
         def scored(how: Transformation) -> Score:
-            if on_stage is not None:  # how many there will be depends on what they say
-                on_stage(1 - DECOYS / (DECOYS + next(done)), "judging: the calibration among its decoys")
+            nonlocal done
+            if on_stage is not None:
+                on_stage(min(done / TRIES, NEARLY_ALL), words)
+            done += iterations // quick
             return small.score(how, iterations=iterations, background=lit, weight=weight)
 
-        return _competition(small, scored)
+        return scored
 
     (few_px, quick), (more_px, thorough) = QUICK, THOROUGH
     few, lit = _small(problem, few_px), problem.smooth or problem.n_planes > 1
@@ -140,35 +150,48 @@ def _checked(problem: Problem, on_stage: Stage | None) -> CalibrationCheck | Non
         return None
     if few.fine() < STRUCTURED:
         return CalibrationCheck(Fit.UNTOLD, {}, 0)
-    check = compete(few, quick, lit=lit)
+    check = _competition(few, scoring(few, quick, lit=lit))
     if check.sure:
         return check
+    if check.better is not None:
+        words = f"judging: so far its PSF explains the photograph better {check.better}"
     many = few if lit else _small(problem, more_px)
-    again = compete(many, thorough, lit=lit)
+    again = _competition(many, scoring(many, thorough, lit=lit))
     if (check.fit, again.fit) in CONTRADICTIONS:
         return replace(again, fit=Fit.UNTOLD, better=None)
     # A faint photograph's large pixels may tell what small ones do not; on the same ones more iterations do.
     same = check.fit is Fit.FOREIGN and many.pixels == few.pixels
     check, small = (again, many) if same or again.fit is not Fit.UNTOLD else (check, few)
-    if check.wrong and not lit:  # by stray light, or by light from beyond the field?
-        again = compete(small, thorough, lit=True)
+    in_light = scoring(small, thorough, lit=True)
+    if check.wrong and not lit and not _stands(check, in_light):
+        again = _competition(small, in_light)
         own, cleared, stands = as_given(again.scores), again.fit is Fit.FITS, True
         if check.better is not None:  # which this competition may not have come to
-            accuser = again.scores.get(check.better) or small.score(
-                check.better, iterations=thorough, background=True
-            )
+            accuser = in_light(check.better)
             cleared = cleared and is_told(own, accuser, small.pixels)
             stands = not _is_near(check.better) or is_ahead(accuser, (own,), small.pixels, NEARLY)
         check = again if cleared else check if stands else replace(again, fit=Fit.UNTOLD, better=None)
     left = float(np.mean(as_given(again.scores).fine)) ** 0.5
     if check.fit in HEAVIER and left > FAR_ABOVE:
-        again = compete(small, thorough, lit=lit, weight=left)
+        again = _competition(small, scoring(small, thorough, lit=lit, weight=left))
         check = again if again.fit in HEAVIER[check.fit] and _is_certain(again) else check
     if check.wrong and small.clipped > MOST_CLIPPED:
         return replace(check, fit=Fit.UNTOLD, better=None)
     given = _given(problem).depths
     one = given.varies and not problem.depths.varies and given.field_error > VARIED
     return None if one and check.fit in (Fit.FOREIGN, Fit.UNTOLD) else check
+
+
+def _stands(check: CalibrationCheck, in_light: Callable[[Transformation], Score]) -> bool:
+    """Whether a far decoy is better whatever stray light there is, or light from beyond the field.
+
+    ``in_light`` scores with a background. No other decoy has to be asked where the calibration itself is not
+    ahead of that one.
+    """
+    if check.better not in FAR:
+        return False
+    own = as_given({how: in_light(how) for how in (GIVEN, BETWEEN)})
+    return not is_told(own, in_light(check.better), check.pixels)
 
 
 @dataclass(frozen=True, slots=True)

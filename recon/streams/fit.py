@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor, wait
 from dataclasses import replace
 from typing import NamedTuple
 
-from recon.reconstruction.decoys import check_calibration
-from recon.reconstruction.problem import Problem
+from recon.reconstruction.decoys import AMONG, check_calibration
+from recon.reconstruction.problem import Problem, Stage
 from recon.reconstruction.reduction import reduced_calibration
 from recon.reconstruction.selection import with_background
 from recon.streams.stillness import SceneState
@@ -19,6 +20,11 @@ SHARE = 0.1
 """Part of the time that checks may take, at most."""
 FIRST_S = 1.0
 """The first pictures have the machine to themselves."""
+NOT_JUDGED = "The calibration is not judged yet"
+"""Begins what is said of it until the first check of frames in a light has ended."""
+TOLD = 0.05
+"""Share of a check from which is said how long it takes."""
+AT = "it is held against turned and mirrored copies of itself"
 MORE_FRAMES = 4
 """Factor in frames averaged from which a still scene may tell what it did not tell before."""
 
@@ -52,6 +58,7 @@ class CalibrationWatch:
         self._not_before = time.monotonic() + FIRST_S
         self._frames = 0
         """Averaged in the frames that were checked last; 0: they are another scene's."""
+        self._stage = _Stage()
 
     def see(self, problem: Callable[[], Problem], binning: int, scene: SceneState, frames: int) -> None:
         """Take note of the newest picture; begin a check where one is due.
@@ -76,7 +83,8 @@ class CalibrationWatch:
         self._frames = frames
         posed = problem()
         pool = ThreadPoolExecutor(1, "calibration check")
-        self._running = pool.submit(_found, posed, self._calibration, binning)
+        self._stage = _Stage()
+        self._running = pool.submit(_found, posed, self._calibration, binning, self._stage)
         pool.shutdown(wait=False)
 
     def in_another_light(self) -> None:
@@ -88,6 +96,16 @@ class CalibrationWatch:
         """Wait until the check that runs is over."""
         if self._running is not None:
             wait((self._running,))
+
+    @property
+    def awaited(self) -> str:
+        """That nothing is known of the calibration yet, what is looked at and for how long; else empty."""
+        self._look()
+        if self.is_known:
+            return ""
+        if self._running is None:
+            return f"{NOT_JUDGED}: in a moment {AT}"
+        return f"{NOT_JUDGED}: {self._stage.words}"
 
     @property
     def doubt(self) -> str:
@@ -102,13 +120,33 @@ class CalibrationWatch:
             self._not_before = time.monotonic() + seconds * (1 / SHARE - 1)
 
 
+class _Stage:
+    """How far a check is."""
+
+    def __init__(self) -> None:
+        self._begun_s, self._reached = math.inf, (0.0, AMONG)
+
+    def __call__(self, share: float, words: str) -> None:
+        self._begun_s, self._reached = min(self._begun_s, time.monotonic()), (share, words)
+
+    @property
+    def words(self) -> str:
+        """What is looked at, and about how long it takes, once that can be told."""
+        share, words = self._reached
+        at = AT if words == AMONG else f"{words.removeprefix('judging: ')}, which is looked at again"
+        if share < TOLD:
+            return at
+        left_s = (time.monotonic() - self._begun_s) * (1 - share) / share
+        return f"{at}, up to about {math.ceil(left_s)} s more"
+
+
 class _Found(NamedTuple):
     doubt: str
     advice: str
     seconds: float
 
 
-def _found(problem: Problem, calibration: Calibration | None, binning: int) -> _Found:
+def _found(problem: Problem, calibration: Calibration | None, binning: int, on_stage: Stage) -> _Found:
     """Look for stray light, then whether the calibration explains the rest."""
     began = time.monotonic()
     advice = ""
@@ -120,7 +158,7 @@ def _found(problem: Problem, calibration: Calibration | None, binning: int) -> _
             problem = with_background(free, calibration, restoring=False)
             if problem.smooth:
                 advice = "There is smooth stray light: pictures would gain by a background (--background)."
-        check = check_calibration(problem)
+        check = check_calibration(problem, on_stage=on_stage)
         doubt = "" if check is None else "".join(check.sentences[:1])
     except Exception as error:  # noqa: BLE001 - pictures are worth more than what is said of them
         doubt = f"whether the calibration fits could not be found out: {error}"

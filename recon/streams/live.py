@@ -472,6 +472,7 @@ class LiveReconstructor:
         """Return a picture: of ``done`` iterations, of the filter (0), or of a dark frame (None)."""
         filtered, detail = not done, level.detail
         plane = self._filtered_plane(detail) if filtered else self.live.plane
+        doubt = self._unlit() if done is None else NOISE_ONLY if self._dark else self._fit.doubt
         of = f"{self._n_planes} depths" if filtered else detail.depths(self._z_um)
         return LivePicture(
             image=self.shown(volume, detail.planes),
@@ -492,7 +493,8 @@ class LiveReconstructor:
             if plane is None
             else f"depth {plane} of {of}",
             camera=level.camera(filtered=filtered, varies=self._one_of_many),
-            doubt=self._unlit() if done is None else NOISE_ONLY if self._dark else self._fit.doubt,
+            doubt=doubt,
+            awaited="" if doubt else self._fit.awaited,
         )
 
     def _unlit(self) -> str:

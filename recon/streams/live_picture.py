@@ -114,12 +114,14 @@ class LivePicture:
     """What besides one PSF a depth on all pixels made it, in words: ``"local model, background"``."""
     doubt: str = ""
     """Why this is no picture of the scene, in words; empty where nothing speaks against it."""
+    awaited: str = ""
+    """That the calibration is not judged yet, in words; empty once it was, and where there is a doubt."""
 
     @property
     def quality(self) -> str:
         """What the picture is worth, in words: ``"binned 2 x 2, 3 iterations (41 in all), moving"``.
 
-        A doubt comes first.
+        A doubt comes first, or that nothing is known of the calibration yet.
         """
         pixels = "all pixels" if self.binning == 1 else f"binned {self.binning} x {self.binning}"
         many = "" if self.iterations == 1 else "s"
@@ -130,7 +132,12 @@ class LivePicture:
         scene = f"still, {self.frames} frames averaged" if self.frames > 1 else str(self.scene)
         settled = "settled" if self.settled else ""
         worth = ", ".join(filter(None, (pixels, self.shown, self.camera, how, scene, settled)))
-        return f"{self.doubt}: {worth}" if self.doubt else worth
+        return ": ".join(filter(None, (self.said, worth)))
+
+    @property
+    def said(self) -> str:
+        """What is doubted, or not known yet; empty where nothing speaks against the picture."""
+        return self.doubt or self.awaited
 
 
 @dataclass(frozen=True)

@@ -8,6 +8,7 @@ from typing import Any
 
 import pytest
 
+from recon.reconstruction.decoys import AMONG
 from recon.streams import fit
 from recon.streams.fit import CalibrationWatch
 from recon.streams.stillness import SceneState
@@ -119,7 +120,7 @@ def test_stray_light_is_looked_for_where_a_photograph_would_have_a_background_fo
         looked.append((problem.options.solver, calibration))
         return SimpleNamespace(smooth=stray)
 
-    def check(problem: SimpleNamespace) -> SimpleNamespace:
+    def check(problem: SimpleNamespace, **__: object) -> SimpleNamespace:
         judged.append(problem.smooth)
         return SimpleNamespace(sentences=("it does not fit.", "Nor does this."))
 
@@ -131,7 +132,7 @@ def test_stray_light_is_looked_for_where_a_photograph_would_have_a_background_fo
         smooth=known == "with a background", options=SimpleNamespace(solver="admm-sensor")
     )
     calibration: Any = None if known == "PSF alone" else SimpleNamespace()
-    found = fit._found(posed, calibration, 3)
+    found = fit._found(posed, calibration, 3, fit._Stage())
     asked = known == "calibration"
     assert looked == ([("auto", (3, None))] if asked else [])
     assert judged == [stray if asked else posed.smooth]
@@ -141,13 +142,48 @@ def test_stray_light_is_looked_for_where_a_photograph_would_have_a_background_fo
 
 def test_what_cannot_be_checked_is_said_and_what_fits_is_not(monkeypatch: pytest.MonkeyPatch) -> None:
     posed: Any = SimpleNamespace(smooth=False)
-    monkeypatch.setattr(fit, "check_calibration", lambda _: None)
-    assert fit._found(posed, None, 1).doubt == ""
-    monkeypatch.setattr(fit, "check_calibration", lambda _: SimpleNamespace(sentences=()))
-    assert fit._found(posed, None, 1).doubt == ""
+    monkeypatch.setattr(fit, "check_calibration", lambda _, **__: None)
+    assert fit._found(posed, None, 1, fit._Stage()).doubt == ""
+    monkeypatch.setattr(fit, "check_calibration", lambda _, **__: SimpleNamespace(sentences=()))
+    assert fit._found(posed, None, 1, fit._Stage()).doubt == ""
 
-    def breaks(_: object) -> None:
+    def breaks(_: object, **__: object) -> None:
         raise ArithmeticError("no light")
 
     monkeypatch.setattr(fit, "check_calibration", breaks)
-    assert fit._found(posed, None, 1).doubt == "Whether the calibration fits could not be found out: no light"
+    assert (
+        fit._found(posed, None, 1, fit._Stage()).doubt
+        == "Whether the calibration fits could not be found out: no light"
+    )
+
+
+def test_until_a_check_has_ended_it_is_said_what_is_looked_at_and_for_how_long(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    now_s, asked, told = [0.0], threading.Event(), threading.Event()
+    monkeypatch.setattr(fit, "time", SimpleNamespace(monotonic=lambda: now_s[0]))
+
+    def check(_: Any, *, on_stage: Any) -> SimpleNamespace:
+        on_stage(0.0, AMONG)
+        now_s[0] += 2.0
+        on_stage(0.25, "judging: so far its PSF explains the photograph better mirrored")
+        asked.set()
+        told.wait(20)
+        return SimpleNamespace(sentences=("it does not fit",))
+
+    monkeypatch.setattr(fit, "check_calibration", check)
+    watch = CalibrationWatch()
+    assert watch.awaited == f"{fit.NOT_JUDGED}: in a moment {fit.AT}"
+    now_s[0] = fit.FIRST_S
+    posed: Any = SimpleNamespace(smooth=False)
+    watch.see(lambda: posed, 1, SceneState.STILL, 1)
+    assert asked.wait(20)
+    so_far = "so far its PSF explains the photograph better mirrored, which is looked at again"
+    assert watch.awaited == f"{fit.NOT_JUDGED}: {so_far}, up to about 6 s more"
+    assert not watch.doubt, "it may be cleared"
+    told.set()
+    watch.wait()
+    assert watch.awaited == ""
+    assert watch.doubt == "It does not fit"
+    watch.in_another_light()
+    assert watch.awaited.startswith(fit.NOT_JUDGED)

@@ -10,7 +10,7 @@ import pytest
 
 from recon import Calibration
 from recon.base.metrics import psnr
-from recon.streams.fit import CalibrationWatch
+from recon.streams.fit import NOT_JUDGED, CalibrationWatch
 from recon.streams.live import LiveReconstructor
 from recon.streams.live_picture import DARK, NOISE_ONLY, UNLIT, UNLIT_SO_FAR
 from recon.streams.stillness import SceneState, has_light
@@ -91,9 +91,13 @@ def test_a_calibration_that_does_not_fit_is_said_of_every_picture(psf: np.ndarra
     reconstructor.feed(photograph(0, 0))
     assert reconstructor._fit._running is None, "the first pictures are not held up by it"
     reconstructor._fit._not_before = 0.0  # at once
-    assert not reconstructor.feed(photograph(0, 1)).doubt
+    unjudged = reconstructor.feed(photograph(0, 1))
+    assert not unjudged.doubt
+    assert unjudged.quality.startswith(unjudged.awaited)
+    assert unjudged.awaited.startswith(NOT_JUDGED)
     reconstructor._fit.wait()
     picture = reconstructor.feed(photograph(0, 2))
+    assert not picture.awaited, "the verdict took its place"
     assert says in picture.doubt
     assert bool(says) == bool(picture.doubt)
     assert not says or re.match("(The|This|What|It|A) [a-z]", picture.doubt), picture.doubt
@@ -109,6 +113,7 @@ def test_what_the_calibration_is_checked_by_and_what_is_advised_is_said_once(
 
         def __init__(self, calibration: Calibration | None = None) -> None:
             self.calibration, self.advice, self.seen = calibration, "", []
+            self.awaited = ""
             made.append(self)
 
         def see(self, posed: Any, binning: int, scene: SceneState, frames: int) -> None:
