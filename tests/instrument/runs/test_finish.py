@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
-from unittest.mock import Mock
+from unittest.mock import MagicMock, Mock
 
 import pytest
 
@@ -38,6 +38,19 @@ def test_a_run_keeps_the_words_of_what_ended_it(error: BaseException | None, tex
     writer.finish.assert_called_once_with(FinishReason.FAILED, text)
     notes = getattr(error, "__notes__", [])
     assert notes == ([] if error is None else ["What was acquired was in runs/one, which is gone or moved."])
+
+
+@pytest.mark.parametrize("error", [None, ValueError("too dark")])
+def test_who_asked_for_the_end_meanwhile_is_told_where_the_run_is_where_no_error_tells_it(
+    error: BaseException | None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    held = MagicMock()
+    monkeypatch.setattr(finish, "interrupts_held", lambda: held)
+    ended(error)
+    answered = [call.args for call in held.__enter__.return_value.answer.call_args_list]
+    assert answered == (
+        [("What was acquired was in runs/one, which is gone or moved.",)] if error is None else []
+    )
 
 
 def test_without_an_error_the_first_failure_is_raised_with_the_others_and_the_place() -> None:

@@ -83,13 +83,15 @@ def test_colour_and_floats_and_what_is_said_over_what_the_file_tells(tmp_path: P
     told = {"axes": "TYXS", "TimeIncrement": 1.0, "PhysicalSizeX": 9.0, "PhysicalSizeXUnit": "µm"}
     tifffile.imwrite(tmp_path / "c.ome.tif", colour, ome=True, photometric="rgb", metadata=told)
     np.save(tmp_path / "f.npy", FRAMES[:4].astype(np.float32) / 7)
+    done: list[tuple[int, int]] = []
     for name, kind in (("c.ome.tif", "RGB8"), ("f.npy", "Mono16")):
         film = read_stack(tmp_path / name)
-        run = import_film(film, tmp_path / f"runs-{kind}", "x", said)
+        run = import_film(film, tmp_path / f"runs-{kind}", "x", said, lambda *n: done.append(n))
         np.testing.assert_array_equal(run.frame(3), film.pixels[3])
         assert run.frame_period_s == pytest.approx(0.04)
         assert run.provenance["pixel_pitch_um"] == 3.0
         assert run.metadata(0).pixel_format == kind
+    assert done == [(4, 4)] * 2
 
 
 @pytest.mark.parametrize(

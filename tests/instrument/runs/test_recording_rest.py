@@ -93,6 +93,9 @@ def test_settings_that_are_refused_half_way_leave_the_camera_as_it_was(tmp_path:
         assert camera_settings(bench.camera) == before
         assert bench.led_array is not None
         assert bench.led_array.pattern != LIT
+        with pytest.raises(OSError, match="disk"), rest.set_up(bench):
+            raise OSError("the disk is full")
+        assert bench.led_array.pattern != LIT
 
 
 def test_one_that_was_ended_on_purpose_or_is_of_another_camera_is_not_offered(tmp_path: Path) -> None:

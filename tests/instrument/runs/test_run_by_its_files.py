@@ -9,11 +9,13 @@ from typing import Any
 
 import pytest
 
+from instrument.files.calibration_file import CALIBRATION_FILES
 from instrument.runs.export import _told
 from instrument.runs.log import Gap
 from instrument.runs.repair import file_problems
+from instrument.runs.results import result_problems
 from instrument.runs.run import FinishReason, Run
-from instrument.runs.run_files import log_size
+from instrument.runs.run_files import RunFiles, log_size
 from instrument.runs.writer import RunWriter
 from tests.instrument.files.test_atomic import open_below
 from tests.instrument.runs.test_store import BENCH, frame, new_run
@@ -119,3 +121,40 @@ def test_an_array_is_held_against_the_last_of_the_logs_ends(tmp_path: Path) -> N
         again.write([frame(i) for i in (2, 3, 4)])
         again.finish(FinishReason.COMPLETED)
     assert [str(problem) for problem in file_problems(Run.open(path))] == []
+
+
+def test_an_array_grows_with_the_first_frame_beyond_it(tmp_path: Path) -> None:
+    with RunWriter.create(tmp_path, label="r", bench=BENCH) as writer:
+        writer.write([frame(0)])
+        assert Run.open(writer.path).array.n_frames == 256
+        writer.write([frame(256)])
+        assert Run.open(writer.path).array.n_frames == 512
+        writer.write([frame(1600)])
+        assert Run.open(writer.path).array.n_frames == 1601
+        assert sorted(writer.finish(FinishReason.COMPLETED).records) == [0, 256, 1600]
+
+
+@pytest.mark.parametrize(
+    ("copy", "state", "is_foreign"),
+    [
+        ('{"id": "a"}', "b", True),
+        ('{"id": "a"}', "a", False),
+        ('{"id": "a"}', None, False),
+        ("{}", "b", False),
+        ("[1]", "b", False),
+        ("{", "b", False),
+    ],
+)
+def test_a_log_with_anothers_identifier_is_foreign(
+    tmp_path: Path, copy: str, state: str | None, *, is_foreign: bool
+) -> None:
+    assert RunFiles(tmp_path, {"provenance.json": copy}).log_is_foreign(state) is is_foreign
+    (tmp_path / "provenance.json").write_text('{"id": "a"}')
+    assert not RunFiles(tmp_path, {"provenance.json": copy}).log_is_foreign(state)
+
+
+def test_a_calibration_that_is_being_written_is_no_result_yet(tmp_path: Path) -> None:
+    for name in ("calibration", ".calibration"):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / CALIBRATION_FILES[0]).write_text("{")
+    assert {problem.of for problem in result_problems(tmp_path)} == {"calibration"}

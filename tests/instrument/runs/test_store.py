@@ -96,6 +96,8 @@ def test_others_tools_read_the_frames(tmp_path: Path, shape: tuple[int, ...], av
         writer.write([frame(0, shape), frame(2, shape)])
         run = writer.finish(FinishReason.COMPLETED)
     group = zarr.open_group(run.path / "frames.ome.zarr", mode="r")
+    described = json.loads((run.path / "frames.ome.zarr" / "zarr.json").read_text())
+    assert (described["zarr_format"], described["node_type"]) == (3, "group")
     image = Image.from_zarr(group)
     axes = image.ome_attributes.multiscales[0].axes
     assert [axis.name for axis in axes] == (["t", "y", "x"] if len(shape) == 2 else ["t", "c", "y", "x"])
