@@ -30,7 +30,13 @@ def ended(error: BaseException | None = None, stop: Any = None, end: Any = None)
 
 @pytest.mark.parametrize(
     ("error", "text"),
-    [(None, ""), (ValueError("too dark"), "too dark"), (ZeroDivisionError(), "ZeroDivisionError")],
+    [
+        (None, ""),
+        (ValueError("too dark"), "too dark"),
+        (ZeroDivisionError(), "ZeroDivisionError"),
+        (KeyboardInterrupt(), ""),
+        (KeyboardInterrupt("SIGTERM came"), "SIGTERM came"),
+    ],
 )
 def test_a_run_keeps_the_words_of_what_ended_it(error: BaseException | None, text: str) -> None:
     run, writer = ended(error)

@@ -18,7 +18,7 @@ from instrument.runs.run import FinishReason, Run
 from instrument.runs.run_files import RunFiles, log_size
 from instrument.runs.writer import RunWriter
 from tests.instrument.files.test_atomic import open_below
-from tests.instrument.runs.test_store import BENCH, frame, new_run
+from tests.instrument.runs.test_store import BENCH, frame, new_run, plan
 
 
 def recorded(folder: Path, *indices: int) -> Path:
@@ -121,6 +121,19 @@ def test_an_array_is_held_against_the_last_of_the_logs_ends(tmp_path: Path) -> N
         again.write([frame(i) for i in (2, 3, 4)])
         again.finish(FinishReason.COMPLETED)
     assert [str(problem) for problem in file_problems(Run.open(path))] == []
+    described = path / "frames.ome.zarr" / "0" / "zarr.json"
+    described.write_bytes(described.read_bytes() + b" ")  # it reads the same
+    (problem,) = file_problems(Run.open(path))
+    assert (problem.name, problem.problem) == ("frames.ome.zarr/0/zarr.json", "is not as it was written")
+
+
+def test_what_a_newer_program_noted_in_a_plan_is_said_to_be_left_out(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    with new_run(tmp_path) as writer:
+        writer.keep_text("plan.json", json.dumps(json.loads(plan().to_json()) | {"mood": "blue"}))
+    assert Run.open(writer.path).plan == plan()
+    assert "'mood', which this program does not know" in caplog.text
 
 
 def test_an_array_grows_with_the_first_frame_beyond_it(tmp_path: Path) -> None:

@@ -309,6 +309,20 @@ def test_penalties_are_those_by_which_cases_left_out_are_told_best_and_the_thres
         assert not np.array_equal(folds[0], folds[1])
 
 
+@pytest.mark.parametrize(("first_failure", "last_reliable"), [(95, 62), (30, 30)])
+def test_the_threshold_is_no_higher_than_the_highest_and_lets_no_more_failures_pass(
+    first_failure: int, last_reliable: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    odds, places = np.linspace(-8, 2, 100), np.random.default_rng(2).normal(size=(100, 2))
+    monkeypatch.setattr(chance, "_left_out", lambda *_: odds)
+    monkeypatch.setattr(chance, "_curve", lambda *_: (0.0, 0.0))
+    severities = np.where(np.arange(100) < first_failure, 0.5, 2.0)
+    unseen = logistic(odds / 2)
+    assert unseen[62] <= HIGHEST < unseen[63]
+    found = fitted(("load", "lit"), places, severities, range(100))
+    assert found.reliable == pytest.approx(unseen[last_reliable])
+
+
 def test_the_threshold_counts_those_of_which_the_chance_decides() -> None:
     places, severities = cases()
     wrong = severities.copy()
