@@ -11,11 +11,13 @@ import pytest
 
 from instrument.files.calibration_file import CALIBRATION_FILES
 from instrument.runs.export import _told
+from instrument.runs.inspection import verify
 from instrument.runs.log import Gap
+from instrument.runs.recording_rest import rest_of
 from instrument.runs.repair import file_problems
 from instrument.runs.results import result_problems
 from instrument.runs.run import FinishReason, Run
-from instrument.runs.run_files import RunFiles, log_size
+from instrument.runs.run_files import RunError, RunFiles, log_size, refuse_within
 from instrument.runs.writer import RunWriter
 from tests.instrument.files.test_atomic import open_below
 from tests.instrument.runs.test_store import BENCH, frame, new_run, plan
@@ -68,6 +70,10 @@ def test_a_look_at_sizes_reads_what_was_noted_as_damaged_and_no_more(tmp_path: P
     assert [one.index for one in Run.open(path).damaged(read=False, noted=[1, 2])] == [1]
     chunk.write_bytes(whole[:-1])
     assert [one.index for one in Run.open(path).damaged(read=False)] == [1], "its size tells"
+    assert [one.index for one in verify(Run.open(path), read=False).damaged] == [1]
+    assert not (path / "damaged.json").exists(), "what reading finds is noted"
+    verify(Run.open(path))
+    assert (path / "damaged.json").exists()
 
 
 def test_a_kept_text_has_its_copy_in_the_log(tmp_path: Path) -> None:
@@ -164,6 +170,28 @@ def test_a_log_with_anothers_identifier_is_foreign(
     assert RunFiles(tmp_path, {"provenance.json": copy}).log_is_foreign(state) is is_foreign
     (tmp_path / "provenance.json").write_text('{"id": "a"}')
     assert not RunFiles(tmp_path, {"provenance.json": copy}).log_is_foreign(state)
+
+
+@pytest.mark.parametrize(("asked", "left"), [(3, 1), (2, None)])
+def test_one_frame_that_a_recording_lacks_is_worth_taking(
+    tmp_path: Path, asked: int, left: int | None
+) -> None:
+    with RunWriter.create(tmp_path, label="r", bench=BENCH) as writer:
+        writer.start(n_frames=asked)
+        writer.write([frame(0), frame(1)])
+        rest = rest_of(writer.finish(FinishReason.STOPPED).path)
+    assert left == (None if rest is None else rest.n_frames)
+
+
+@pytest.mark.parametrize("within", ["", "deep/down"])
+def test_no_run_is_kept_within_another(tmp_path: Path, within: str) -> None:
+    path = recorded(tmp_path, 0)
+    with pytest.raises(RunError, match="no other run is kept there") as refused:
+        refuse_within(path / within)
+    assert f"e.g. {tmp_path}" in str(refused.value)
+    refuse_within(tmp_path / within)
+    (path / "log.jsonl").unlink()
+    refuse_within(path / within)
 
 
 def test_a_calibration_that_is_being_written_is_no_result_yet(tmp_path: Path) -> None:

@@ -9,7 +9,7 @@ from recon.camera.convolution import Convolution
 from recon.camera.factors import Erasures
 from recon.priors import L1, Box, NonNegativity, TotalVariation
 from recon.solvers import Admm, Penalties, StoppingRules
-from recon.solvers.admm import SETTLING
+from recon.solvers.admm import SETTLING, _energy
 from tests.recon.solvers.test_sensor_admm_by_definition import DATA, PSFS, SENSOR, TV, VALID, turned
 from tests.recon.solvers.test_sensor_admm_other_data import Opaque
 
@@ -75,6 +75,12 @@ def test_a_prior_known_by_its_prox_has_the_minimum_of_the_same_prior_in_the_swee
         for prior in (known, Opaque(known))
     ]
     assert ends[1] == pytest.approx(ends[0], rel=1e-3)
+
+
+@pytest.mark.parametrize("width", [6, 7])
+def test_the_energy_of_half_a_spectrum_is_the_whole_ones(width: int) -> None:
+    image = np.random.default_rng(1).normal(size=(5, width))
+    assert _energy(np.fft.rfft2(image), width) == pytest.approx(np.sum(np.abs(np.fft.fft2(image)) ** 2))
 
 
 def test_it_begins_with_the_mean_power_of_its_psf() -> None:

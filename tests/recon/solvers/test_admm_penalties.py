@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 
 from recon.camera.convolution import Convolution
+from recon.camera.factors import Erasures
 from recon.priors import NonNegativity, TotalVariation
 from recon.solvers import Admm, Penalties, StoppingRules
-from recon.solvers.admm import DataSplit
+from recon.solvers.admm import SETTLING, DataSplit
 
 RNG = np.random.default_rng(3)
 CAMERA = Convolution(RNG.random((1, 4, 5)) ** 3, (7, 8), dtype=np.float64)
@@ -28,6 +29,25 @@ def test_a_penalty_that_is_given_stays_and_one_that_is_not_follows_the_weight_ov
     own = run(1.0, None)
     assert run(100.0, None) == pytest.approx(own, rel=1e-6), "in other units it is the same problem"
     assert own[1, 0] != pytest.approx(POWER)
+
+
+def test_penalties_change_before_the_iterations_that_settle_them_alone() -> None:
+    solver = Admm(CAMERA, DATA, TV)
+    changed, before = [], np.array(solver.penalties)
+    for iteration in range(40):
+        solver.advance()
+        if not np.array_equal(solver.penalties, before):
+            changed.append(iteration)
+        before = np.array(solver.penalties)
+    assert tuple(changed) == SETTLING
+
+
+def test_what_stands_at_erased_pixels_is_no_data() -> None:
+    valid = np.arange(56).reshape(CAMERA.range_shape) % 5 > 0
+    operator = Erasures(valid, CAMERA.range_shape, np.float64) @ CAMERA
+    one, other = (Admm(operator, np.where(valid, DATA, hole), TV) for hole in (0.0, np.nan))
+    for _ in range(3):
+        assert one.advance().objective == other.advance().objective
 
 
 def test_without_a_weight_no_penalty_is_taken_away() -> None:
@@ -68,3 +88,4 @@ def test_the_datas_split_begins_with_what_the_object_casts_and_counts_its_change
         before = prox()
         split.solve(0, RNG.random(camera.grid_shape), 0.3, 0.2)
         assert split.sums[0, 2] == pytest.approx(np.sum((prox() - before) ** 2))
+        assert split.sums[0, 3] == pytest.approx(np.sum(prox() ** 2))

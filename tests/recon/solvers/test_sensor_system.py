@@ -44,6 +44,8 @@ def test_it_is_solved_in_few_steps_as_a_dense_matrix_solves_it(valid, restraint)
     assert made.steps <= 12  # 7 to 10 found
     assert np.linalg.norm(e - exact) < 2e-4 * np.linalg.norm(exact)
     assert valid is None or not e[~valid].any()
+    if not restraint:
+        np.testing.assert_allclose(made.masked(e.copy()), e, atol=1e-12)  # as the data are
 
 
 @pytest.mark.parametrize("restraint", [None, 0.0, 1e-2, 0.3])
@@ -115,6 +117,28 @@ def test_a_camera_that_is_no_convolution_is_preconditioned_by_its_central_one():
     made.solve(right, e := np.zeros(SENSOR))
     assert made.steps <= 12  # 10 found, 30 and no end with the inverse turned over
     assert np.linalg.norm(right - e - made._bend(e)) <= 1.01e-4 * np.linalg.norm(right)
+
+
+@pytest.mark.parametrize("restraint", [None, 0.0, 0.3])
+def test_there_the_inverse_is_that_of_a_sensor_that_covers_half_the_grid(restraint):
+    background = None
+    if restraint is not None:
+        background = BackgroundRemoval((1, *SENSOR), (3, 4), None, np.float64, restraint)
+    measured = SensorData(np.zeros((1, *SENSOR)), None, background)
+    made = SensorSystem(CAMERA.grid_shape, CAMERA.sensor_window, measured, dtype=np.float64, bend=lambda e: e)
+    q = CAMERA.power()[0] / CAMERA.power().mean()
+    made.set_curvature(q)
+    made.set_scale(5.0)
+    made._adapt()
+    residual = RNG.standard_normal(SENSOR)
+    spread = np.zeros(CAMERA.grid_shape)
+    weigh = system(None, restraint).masked if restraint else np.array
+    spread[CAMERA.sensor_window] = weigh(residual.copy())
+    spread = np.fft.irfft2(np.fft.rfft2(spread) / (1 + 5.0 / 2 * q), CAMERA.grid_shape)
+    expected = system(None, restraint).masked(spread[CAMERA.sensor_window].copy())
+    if restraint:  # smooth light is its own inverse
+        expected += residual - system(None, restraint).masked(residual.copy())
+    np.testing.assert_allclose(made._preconditioned(residual), expected, atol=1e-12)
 
 
 @pytest.mark.parametrize(

@@ -196,6 +196,8 @@ def test_with_a_calibration_that_is_not_known_to_be_right_nothing_is_reliable(
     numbers = evidence().as_json()
     verdict = Verdict(before, "admm tv", 0.1, (), numbers).with_calibration(check)
     assert (verdict.region, verdict.calibration) == (after, check)
+    assert verdict.as_json()["calibration"] == check.as_json()
+    assert Verdict(before, "admm tv", 0.1, (), numbers).as_json()["calibration"] is None
     assert ("does not belong to this photograph" in verdict.sentences[0]) == (fit is Fit.FOREIGN)
     is_said = "does not tell whether the calibration is its own" in verdict.sentences[0]
     assert is_said == (fit is Fit.UNTOLD and before is Region.INSIDE)
