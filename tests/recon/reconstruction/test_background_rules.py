@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from types import SimpleNamespace
 from typing import Any
 
@@ -280,6 +280,8 @@ def test_no_shade_is_taken_where_it_is_none(monkeypatch: pytest.MonkeyPatch) -> 
     # A deep one explains nearly anything: for each unit of its logarithm 1.1 of what usual errors leave.
     assert shade_found(monkeypatch, numbers=2.3 * NUMBERS)[0] is not None  # 4 are gone, of 3.2
     assert shade_found(monkeypatch, numbers=2.3 * NUMBERS, given2=10.0)[0] is None
+    # What is left counts by its squares: 5 less 1.7 are gone, of 3.2.
+    assert shade_found(monkeypatch, numbers=2.3 * NUMBERS, rest2=3.0)[0] is not None
 
 
 def looked_at(problem: Problem, monkeypatch: pytest.MonkeyPatch) -> bool:
@@ -342,3 +344,125 @@ def test_nothing_is_looked_for_in_volumes(monkeypatch: pytest.MonkeyPatch) -> No
     problem = Problem.of(Measurement(image, noise=0.1), calibration, ReconstructionOptions())
     assert problem.n_planes == 2
     assert not looked_at(problem, monkeypatch)
+
+
+@pytest.mark.parametrize(("share", "looks"), [(1.0, True), (0.3, False)])
+def test_nothing_is_looked_for_where_erased_pixels_leave_no_small_copy(
+    share: float, monkeypatch: pytest.MonkeyPatch, *, looks: bool
+) -> None:
+    rng = np.random.default_rng(0)
+    image, psf = rng.random((2, 260, 20), np.float32)
+    measurement = Measurement(image, noise=0.1, erasures=rng.random(image.shape) >= share)
+    assert looked_at(Problem.of(measurement, psf, ReconstructionOptions()), monkeypatch) is looks
+
+
+def restored(
+    monkeypatch: pytest.MonkeyPatch,
+    *,
+    mean: float = 50.0,
+    given2: float = 9.0,
+    explained2: float = 1.0,
+    numbers: Any = None,
+    share: float = 0.0,
+    offset: bool = True,
+) -> tuple[Problem, Problem]:
+    """Return a problem, and that with light restored which one number or a shade is found to explain."""
+
+    def left2(_: Any, offset: float) -> Any:
+        return np.array([explained2 if offset == pytest.approx(module.MOST_OFFSET) else given2])
+
+    monkeypatch.setattr(module, "_small", lambda *_: None)
+    monkeypatch.setattr(_Small, "__init__", lambda self, _: vars(self).update(mean=mean, usual2=np.zeros(1)))
+    monkeypatch.setattr(_Small, "left2", left2)
+    monkeypatch.setattr(module, "_shade_of", lambda *_: numbers)
+    monkeypatch.setattr(module, "_offset_of", lambda *_: share)
+    image, psf = np.random.default_rng(0).random((2, 20, 24), np.float32)
+    problem = Problem.of(Measurement(image, noise=0.1), psf, ReconstructionOptions())
+    return problem, with_light_restored(problem, offset=offset)
+
+
+@pytest.mark.parametrize(
+    "facts",
+    [
+        {"share": 0.1, "mean": 0.0},
+        {"share": 0.1, "mean": -1.0},
+        {"share": 0.1, "given2": 0.9},  # nothing lacks
+        {"share": 0.1, "explained2": 8.5},  # an offset explains no more
+        {"share": 0.1, "offset": False},
+        {"share": 0.0},
+    ],
+)
+def test_nothing_is_restored_where_nothing_lacks_or_nothing_explains_it(
+    facts: dict[str, Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    before, after = restored(monkeypatch, **facts)
+    assert after is before
+
+
+def test_an_offset_is_added_in_counts_and_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    before, after = restored(monkeypatch, share=0.1)
+    assert after.measurement.background == -5.0
+    assert after.measurement.found["added_counts"] == 5.0
+    assert "5 counts (10% of its mean) were added" in after.warnings[-1]
+    assert after.warnings[-1].endswith("--no-background leaves it as it is.")
+    assert after.warnings[:-1] == before.warnings
+
+
+@pytest.mark.parametrize("offset", [True, False])
+def test_a_photograph_is_divided_by_its_shade_whatever_else_would_explain_it(
+    offset: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    _, after = restored(monkeypatch, numbers=NUMBERS, share=0.1, offset=offset)
+    shade = shade_of(NUMBERS, (20, 24))
+    np.testing.assert_array_equal(after.measurement.vignetting, shade)
+    assert after.measurement.found["shade"] == NUMBERS.tolist()
+    assert after.measurement.background is None
+    assert f"(to {shade.min():.0%} in its darkest corner)" in after.warnings[-1]
+
+
+@dataclass(frozen=True)
+class Channel:
+    """What is held of a channel on few pixels."""
+
+    data: Counts
+    valid: Counts
+    sensor_shape: tuple[int, int] = (SIDE, SIDE)
+
+
+VALID = np.random.default_rng(1).random((1, SIDE, SIDE)) > 0.2
+CHANNEL: Any = Channel(np.full((1, SIDE, SIDE), 6.0, np.float32), VALID)
+
+
+def test_what_a_channel_leaves_under_a_shade_is_told_in_its_own_light(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    given: list[Any] = []
+
+    def pilot(channel: Channel, iterations: int) -> Any:
+        given.append((channel.data, iterations))
+        return SimpleNamespace(left=np.where(VALID, 3.0, 99.0).astype(np.float32))
+
+    monkeypatch.setattr(module, "pilot", pilot)
+    shade = np.linspace(0.5, 1, SIDE, dtype=np.float32) * np.ones((SIDE, 1), np.float32)
+    found = module._shade_left(CHANNEL, shade, 17)
+    np.testing.assert_allclose(found, np.where(VALID[0], 3 * shade, 0))
+    ((data, iterations),) = given
+    np.testing.assert_allclose(data[0], 6 / shade)
+    assert iterations == 17
+
+
+def test_a_shade_is_fitted_to_what_usual_errors_leave_and_none_is_the_deepest(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    asked: list[Any] = []
+    left = np.arange(float(SIDE**2)).reshape(SIDE, SIDE)
+    monkeypatch.setattr(module, "_shade_left", lambda *given: asked.append(given) or left)
+    monkeypatch.setattr(module, "least_squares", lambda *functions: functions)
+    found: Any = module._shade_fitted(CHANNEL, 4.0)
+    left_of, is_deepest = found
+    np.testing.assert_allclose(left_of(NUMBERS), left.ravel() / 2)
+    ((channel, shade, iterations),) = asked
+    assert (channel, iterations) == (CHANNEL, module.SHADE_ITERATIONS)
+    np.testing.assert_array_equal(shade, shade_of(NUMBERS, (SIDE, SIDE)))
+    assert not is_deepest(NUMBERS)
+    assert is_deepest(9 * NUMBERS)
