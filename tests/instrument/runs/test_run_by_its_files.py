@@ -7,9 +7,11 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
-from instrument.files.calibration_file import CALIBRATION_FILES
+from instrument.files.calibration_file import CALIBRATION_FILES, save_calibration
+from instrument.files.images import write_image
 from instrument.runs.export import _told
 from instrument.runs.inspection import verify
 from instrument.runs.log import Gap
@@ -19,6 +21,7 @@ from instrument.runs.results import result_problems
 from instrument.runs.run import FinishReason, Run
 from instrument.runs.run_files import RunError, RunFiles, log_size, refuse_within
 from instrument.runs.writer import RunWriter
+from recon.types import Calibration
 from tests.instrument.files.test_atomic import open_below
 from tests.instrument.runs.test_store import BENCH, frame, new_run, plan
 
@@ -199,3 +202,50 @@ def test_a_calibration_that_is_being_written_is_no_result_yet(tmp_path: Path) ->
         (tmp_path / name).mkdir()
         (tmp_path / name / CALIBRATION_FILES[0]).write_text("{")
     assert {problem.of for problem in result_problems(tmp_path)} == {"calibration"}
+
+
+@pytest.fixture(name="made")
+def _made(tmp_path: Path) -> Path:
+    """A folder of whole results of each kind; what else lies there is nobody's."""
+    for name in ("photograph.tif", "doubtful_photograph.tif"):
+        write_image(tmp_path / name, np.ones((4, 5), np.uint16))
+    write_image(tmp_path / "height.tif", np.array([[1.0, np.nan], [2.0, 3.0]], np.float32))
+    for name in ("dpc.json", "doubtful_dpc.json"):
+        (tmp_path / name).write_text('{"height_file": "height.tif"}')
+    (tmp_path / "stage.json").write_text('{"height_file": 3}')
+    (tmp_path / "angular_response.json").write_text("[1]")
+    (tmp_path / "notes.json").write_text("{")
+    calibration = Calibration(np.ones((2, 1, 4, 5), np.float32), np.array([[0, 0, 1e3], [0, 0, 2e3]]))
+    save_calibration(calibration, tmp_path / "calibration")
+    assert result_problems(tmp_path) == []
+    return tmp_path
+
+
+@pytest.mark.parametrize(
+    ("damaged", "text", "told", "of", "at_a_look"),
+    [
+        ("photograph.tif", "no picture", "photograph.tif", "photograph.tif", False),
+        ("doubtful_photograph.tif", "none", "doubtful_photograph.tif", "doubtful_photograph.tif", False),
+        ("stage.json", "{", "stage.json", "stage.json", True),
+        ("doubtful_dpc.json", "{", "doubtful_dpc.json", "doubtful_dpc.json", True),
+        ("dpc.json", '{"height_file": "notes.json"}', "dpc.json", "dpc.json", False),
+        ("calibration/calibration.json", "{", "calibration/calibration.json", "calibration", True),
+        (
+            "calibration/psfs.ome.zarr/0/zarr.json",
+            "{",
+            "calibration/psfs.ome.zarr",
+            "calibration",
+            False,
+        ),
+    ],
+)
+def test_a_damaged_result_is_told_by_its_name_and_at_a_look_where_that_reads_it(
+    made: Path, damaged: str, text: str, told: str, of: str, *, at_a_look: bool
+) -> None:
+    (made / damaged).write_text(text)
+    (problem,) = result_problems(made)
+    assert (problem.name, problem.of) == (told, of)
+    assert problem.problem
+    assert bool(result_problems(made, read=False)) is at_a_look
+    assert [one.of for one in result_problems(made, read=False, noted=[of])] == [of]
+    assert bool(result_problems(made, read=False, noted=["another"])) is at_a_look
