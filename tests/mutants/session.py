@@ -276,14 +276,19 @@ class Trials:
 
     # Processes ---------------------------------------------------------------------------------
     def _fork(self, work: Callable[[], object], limit_s: float) -> _Child:
-        """Do something in a process of its own, with its own temporary folder."""
+        """Do something in a process of its own, with its own temporary folder.
+
+        It has ``limit_s`` of the processor, and on the clock as much longer as others crowd the machine: what
+        ends it counts as noticed.
+        """
         self._number += 1
         answer = self._folder / str(self._number)
         sys.stdout.flush()
         process = os.fork()
         if process:
             self._alive.add(process)
-            return _Child(process, answer, time.monotonic() + limit_s)
+            crowd = max(2 * os.getloadavg()[0] / (os.cpu_count() or 1), 1.0)
+            return _Child(process, answer, time.monotonic() + crowd * limit_s)
         try:
             os.setpgid(0, 0)
             signal.signal(signal.SIGTERM, signal.SIG_DFL)

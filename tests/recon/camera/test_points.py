@@ -198,3 +198,39 @@ def test_a_move_that_gains_nothing_is_halved_twice_and_given_up() -> None:
     assert len(tried) == 3
     np.testing.assert_allclose(tried[1:], [tried[0] / 2, tried[0] / 4])
     assert np.abs(tried[0]).max() <= 0.5 + 1e-12
+
+
+def test_functions_of_the_field_are_orthonormal_over_the_beads_and_stay_what_they_are_at_their_border() -> (
+    None
+):
+    beads = np.array([[2.0, -30.0], [10.0, -30.0], [2.0, -11.0], [10.0, -11.0], [5.0, -20.0]])
+    functions = FieldFunctions(1, beads)
+    values = functions.at(beads)
+    np.testing.assert_allclose(values.T @ values / 5, np.eye(3), atol=1e-12)
+    np.testing.assert_allclose(values[:, 0], 1)
+    middle = functions.at(beads[[0, 3]].mean(axis=0)[None])
+    np.testing.assert_allclose(middle[0], values[[0, 3]].mean(axis=0), atol=1e-12)
+    beyond = functions.at(np.array([[99.0, -20.0], [5.0, -99.0]]))
+    np.testing.assert_allclose(beyond, functions.at(np.array([[10.0, -20.0], [5.0, -30.0]])), atol=1e-12)
+
+
+@pytest.mark.parametrize("shape", [(5, 8), (8, 5)])
+def test_a_psf_may_have_any_sides(shape: tuple[int, int]) -> None:
+    psf = RNG.random((1, *shape)).astype(np.float32)
+    expected = np.zeros(SENSOR)
+    top, left = 15 - shape[0] // 2, 17 - shape[1] // 2
+    expected[top : top + shape[0], left : left + shape[1]] = 3 * psf[0]
+    np.testing.assert_allclose(camera(psf).image(points((0, 0, 3.0))), expected, atol=1e-6)
+
+
+def test_a_point_at_the_sensors_edge_is_found_though_its_light_and_place_tell_the_same() -> None:
+    wide = np.exp(-((np.mgrid[:21, :21] - 10) ** 2).sum(axis=0) / 12)[None]
+    seen = camera(wide)
+    image = seen.image(points((-16.2, 3.0, 5.0)))
+    place, light = np.array([-16.0, 3.0]), 4.0
+    left = image - seen.image(points((*place, light)))
+    for _ in range(2):
+        place, light = _refined(seen, left, place, light)
+    np.testing.assert_allclose(place, [-16.2, 3.0], atol=0.01)
+    assert light == pytest.approx(5, rel=0.02)
+    assert np.linalg.norm(left) < 0.01 * np.linalg.norm(image)

@@ -87,6 +87,16 @@ def test_few_of_the_made_ones_are_kept_and_all_are_alike(monkeypatch: pytest.Mon
         assert len(one._kept) <= 2
 
 
+def test_no_more_are_kept_than_there_is_room_for(monkeypatch: pytest.MonkeyPatch) -> None:
+    room = int(3.5 * camera().psfs[0].nbytes)
+    monkeypatch.setattr("recon.camera.points_in_depth.KEPT_BYTES", room)
+    one = camera()
+    for step in range(6):
+        one._made(step)
+    assert len(one._kept) == 3
+    assert sum(psf.nbytes for psf in one._kept.values()) <= room
+
+
 @pytest.mark.parametrize("axis", [None, np.array([[0.0, 0], [50, -20], [100, -40], [150, -60]])])
 def test_rays_lead_to_the_scene_and_back(axis: np.ndarray | None) -> None:
     grid = Grid(

@@ -202,6 +202,8 @@ def test_what_is_lacking_is_more_than_calibrated_cameras_leave() -> None:
     seen = data[valid].astype(float)
     assert made.mean == pytest.approx(2 * seen.mean())
     assert made.usual2 == pytest.approx([0.02**2 * (seen.var() - 1)])
+    dim: Any = _Small([SimpleNamespace(noise=[2.0], data=data / 10, valid=valid)])  # type: ignore[list-item]
+    assert dim.usual2 == [0], "less than noise"
 
 
 @pytest.mark.parametrize(
@@ -280,8 +282,10 @@ def test_no_shade_is_taken_where_it_is_none(monkeypatch: pytest.MonkeyPatch) -> 
     # A deep one explains nearly anything: for each unit of its logarithm 1.1 of what usual errors leave.
     assert shade_found(monkeypatch, numbers=2.3 * NUMBERS)[0] is not None  # 4 are gone, of 3.2
     assert shade_found(monkeypatch, numbers=2.3 * NUMBERS, given2=10.0)[0] is None
-    # What is left counts by its squares: 5 less 1.7 are gone, of 3.2.
-    assert shade_found(monkeypatch, numbers=2.3 * NUMBERS, rest2=3.0)[0] is not None
+    # What is less than usual errors leave is no gain: 3.2 less 1 are gone, of 2.4.
+    assert shade_found(monkeypatch, numbers=2.3 * NUMBERS, given2=10.0, rest2=0.25)[0] is None
+    # What is left counts by its squares: 4.2 less 1.7 are gone.
+    assert shade_found(monkeypatch, numbers=2.3 * NUMBERS, given2=17.4, rest2=3.0)[0] is not None
 
 
 def looked_at(problem: Problem, monkeypatch: pytest.MonkeyPatch) -> bool:
@@ -369,7 +373,7 @@ def restored(
     """Return a problem, and that with light restored which one number or a shade is found to explain."""
 
     def left2(_: Any, offset: float) -> Any:
-        return np.array([explained2 if offset == pytest.approx(module.MOST_OFFSET) else given2])
+        return np.array([{0.0: given2, module.MOST_OFFSET: explained2}[offset]])
 
     monkeypatch.setattr(module, "_small", lambda *_: None)
     monkeypatch.setattr(_Small, "__init__", lambda self, _: vars(self).update(mean=mean, usual2=np.zeros(1)))
@@ -458,9 +462,9 @@ def test_a_shade_is_fitted_to_what_usual_errors_leave_and_none_is_the_deepest(
     left = np.arange(float(SIDE**2)).reshape(SIDE, SIDE)
     monkeypatch.setattr(module, "_shade_left", lambda *given: asked.append(given) or left)
     monkeypatch.setattr(module, "least_squares", lambda *functions: functions)
-    found: Any = module._shade_fitted(CHANNEL, 4.0)
+    found: Any = module._shade_fitted(CHANNEL, 9.0)
     left_of, is_deepest = found
-    np.testing.assert_allclose(left_of(NUMBERS), left.ravel() / 2)
+    np.testing.assert_allclose(left_of(NUMBERS), left.ravel() / 3)
     ((channel, shade, iterations),) = asked
     assert (channel, iterations) == (CHANNEL, module.SHADE_ITERATIONS)
     np.testing.assert_array_equal(shade, shade_of(NUMBERS, (SIDE, SIDE)))

@@ -74,7 +74,7 @@ def tried(
         image[tuple(np.argwhere(VALID)[0])] = least
         solution = np.full((1, planes, 6, 8), 9.0)
         solution[0, :, 1:5, 2:7] = 0.0
-        solution[0, :, 1:3, 2:7] = 1.0
+        solution[0, :, 1:2, 2:7] = 1.0
         return SimpleNamespace(
             background=image[None], solution=solution, left="lit" if coarse.smooth else "plain", weight=0.25
         )
@@ -92,7 +92,7 @@ def test_a_trial_tells_light_and_darkness_of_what_was_measured(monkeypatch: pyte
     """In the noise of few pixels, 0.5 beside 2: data of 4 are 16 there."""
     found, passes = tried(monkeypatch, levels=(2.0, 2.0))
     assert found.light == pytest.approx(2 / 16)
-    assert found.dark == pytest.approx(0.5), "of the scene opposite to the sensor"
+    assert found.dark == pytest.approx(0.75), "of the scene opposite to the sensor"
     assert (found.without, found.lit) == (3, 2)
     assert (found.taken, found.picture, found.least, found.dim) == (POINTS, True, 0, False)
     assert passes == [
