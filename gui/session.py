@@ -16,7 +16,7 @@ from typing import Any, Literal
 from PySide6.QtCore import QObject, Qt, QTimer, Signal
 
 from drivers.camera import Camera
-from drivers.errors import DeviceError, LimitError, StoppedError
+from drivers.errors import DeviceError, DeviceTimeoutError, LimitError, StoppedError
 from drivers.frame import Frame, FrameMetadata
 from gui.background import NewestOnly
 from gui.jobs import BusyError, Job, JobContext, JobRunner, Work, joined, words_for
@@ -295,7 +295,10 @@ class BenchSession(QObject):
             self.note_failure(error)
 
     def note_failure(self, error: DeviceError, *, surely: bool = False) -> None:
-        """Mark the device that an error names as failed, unless it only refused what it was asked."""
+        """Mark the device that an error names as failed, unless it only refused what it was asked.
+
+        One that does not answer stops everything else: light off, motion halted.
+        """
         for kind, device in self.bench.devices.items():
             if (
                 error.device.startswith(device.name)
@@ -303,6 +306,8 @@ class BenchSession(QObject):
                 and (surely or is_gone(device, error))
             ):
                 self._set_state(kind, DeviceState("failed", words_for(error), self.state(kind).simulated))
+                if isinstance(error, DeviceTimeoutError) and not (self._stopping or self.is_closing):
+                    self.stop(f"the {name_of(kind)} does not answer")  # nor is it known what it does
 
     def _look_after_devices(self) -> None:
         """Notice a stream that ended by an error, and devices that were lost while nobody used them."""
@@ -317,8 +322,10 @@ class BenchSession(QObject):
                 self._set_state(kind, DeviceState("failed", text, self.state(kind).simulated))
 
     # STOP ----------------------------------------------------------------------------------------
-    def stop(self) -> None:
+    def stop(self, why: str = "") -> None:
         """STOP: motion halted, light off, the running device jobs cancelled. Returns at once.
+
+        ``why`` where nobody pressed it.
 
         Overtakes everything: the devices' stop functions are called from a thread of their own, again and
         again until no job can start anything any more.
@@ -333,7 +340,7 @@ class BenchSession(QObject):
             self._stop_again = True
             return
         self._stopping = True
-        self.log("warning", "STOP")
+        self.log("warning", f"STOP: {why}." if why else "STOP")
         self._in_thread("STOP", self._stop_all, self.jobs.device_jobs)
 
     def _whatever_happens(self, step: Callable[[], object]) -> None:

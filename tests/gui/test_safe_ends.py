@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import threading
 
+import numpy as np
 import pytest
 from pytestqt.qtbot import QtBot
 
+from drivers.simulated.slm import SimulatedSlm
 from gui.jobs import JobContext, JobState
 from gui.session import BenchSession
 from gui.session_news import OperatorRequest
@@ -131,6 +133,24 @@ def test_a_device_that_never_answers_does_not_keep_the_bench_open(
         session.close()
     assert not any(device.is_open for device in session.bench.devices.values())
     assert any("does not answer" in line for line in lines)
+    answers.set()
+
+
+def test_a_device_that_does_not_answer_stops_everything(
+    qtbot: QtBot, session: BenchSession, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    slm, answers = session.bench.slm, threading.Event()
+    assert slm is not None
+    monkeypatch.setattr(SimulatedSlm, "display", lambda *_: answers.wait(WAIT_MS / 1000))
+    monkeypatch.setattr(type(slm), "longest_call_s", 0.05)
+    lines: list[str] = []
+    session.logged.connect(lambda _, text: lines.append(text))
+    session.bench.source_on()
+    with qtbot.waitSignal(session.stopped, timeout=WAIT_MS):
+        session.jobs.device("A picture", lambda _: slm.display(np.zeros(slm.shape, np.uint8)), {"slm"})
+    assert not session.bench.source_lit
+    assert "STOP: the SLM does not answer." in lines
+    assert session.state("slm").condition == "failed"
     answers.set()
 
 
