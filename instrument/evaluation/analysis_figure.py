@@ -83,7 +83,7 @@ def _panels(analysis: Analysis) -> list[Panel]:
     """Return what draws each panel that has something to show, in the order of the page."""
     tests = analysis.points
     panels: list[Panel] = [lambda axes: _psf(axes, analysis), lambda axes: _autocorrelation(axes, analysis)]
-    if np.isfinite(analysis.axial.hyperfocal_um):
+    if 0 < analysis.axial.hyperfocal_um < np.inf:  # 0: no enlargement makes this PSF another
         panels.append(lambda axes: _depth_of_field(axes, analysis))
     if analysis.depth is not None:
         panels.append(lambda axes: _depth(axes, analysis))

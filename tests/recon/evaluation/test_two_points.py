@@ -245,3 +245,10 @@ def test_nothing_on_the_page_of_an_analysis_runs_into_its_notes() -> None:
         notes = max(text.get_position()[1] for text in page.texts if text.get_text().startswith("•"))
         column = [text.get_position()[1] for text in page.texts if text.get_position()[0] == 0.745]
         assert min(column) - 0.15 / height_in > notes
+    for step_per_um in (0.0, np.inf):  # no depth, or no enlargement, makes this PSF another
+        page = draw_analysis(
+            replace(analysis, axial=replace(analysis.axial, step_per_um=step_per_um)),
+            "A page",
+            simulated=True,
+        )
+        assert not [axes for axes in page.axes if "Depth of field" in axes.get_title(loc="left")]
