@@ -68,7 +68,7 @@ def refuse_input(path: Path) -> None:
             found = "is an input itself"
         elif path.is_dir() and is_within(held, path):
             found = f"holds the input {held}"
-        elif _is_content(held) and is_within(path, held):
+        elif is_content(held) and is_within(path, held):
             found = f"is part of the input {held}"
         else:
             continue
@@ -83,7 +83,7 @@ def _linked(folder: Path) -> Iterator[Path]:
     while left:
         place, found = os.path.realpath(left.pop()), list[os.DirEntry[str]]()
         with contextlib.suppress(PermissionError):  # nor can it be read
-            if place not in seen and _is_content(Path(place)):
+            if place not in seen and is_content(Path(place)):
                 with os.scandir(place) as entries:  # 10^5 names take no Paths
                     found += (entry for entry in entries if entry.is_symlink() or entry.is_dir())
         seen.add(place)
@@ -104,7 +104,7 @@ def is_same(one: Path, other: Path) -> bool:
         return False
 
 
-def _is_content(folder: Path) -> bool:
+def is_content(folder: Path) -> bool:
     """Whether everything in a folder is what it is read for."""
     return folder.is_dir() and not any((folder / own).exists() for own in ("state.json", "calibration.json"))
 

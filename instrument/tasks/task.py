@@ -13,8 +13,8 @@ from pathlib import Path
 from threading import Event
 from typing import TYPE_CHECKING, Any, Protocol
 
-from instrument.files.atomic import protecting
-from instrument.files.errors import BenchError
+from instrument.files.atomic import is_content, is_same, protecting
+from instrument.files.errors import BenchError, FileError
 from instrument.files.orientation import AS_IT_IS, Kind, Orientation
 from recon.base.declare import Option, changed, option, options_of
 
@@ -257,10 +257,28 @@ def guarded(values: Mapping[str, object]) -> Iterator[None]:
     if outputs := [path for name, path in paths if name in WRITTEN]:
         from instrument.runs.run_files import refuse_own_files
 
+        folders = [path for name, path in paths if name not in (*WRITTEN, "scratch") and path.is_dir()]
         for output in outputs:
             refuse_own_files(output)
+            _refuse_one_more_image(output, folders)
     with protecting([path for name, path in paths if name not in WRITTEN]):
         yield
+
+
+def _refuse_one_more_image(output: Path, folders: Sequence[Path]) -> None:
+    """Refuse a result, or one with a preview, that the next reading of a folder would take for an image.
+
+    Raises FileError.
+    """
+    from instrument.files.image_folders import SUFFIXES, images_in
+
+    name = output.name.lower()
+    if output.exists() or not name.endswith((*SUFFIXES, ".ome.zarr")):
+        return
+    for folder in folders:
+        if is_content(folder) and is_same(output.parent, folder) and images_in(folder):
+            problem = f"would be read as one more image of {folder}, an input."
+            raise FileError(output, problem, "Choose another folder for it.")
 
 
 def _paths(values: object, called: str = "") -> Iterator[tuple[str, Path]]:

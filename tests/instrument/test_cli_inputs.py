@@ -210,8 +210,30 @@ def test_a_file_and_a_folder_are_known_by_the_disk_not_by_their_names(
     ):
         with refused, guarded({"psf": read, "out": tmp_path / output}):
             refuse_input(tmp_path / output)
-    with guarded({"psf": psfs, "out": tmp_path / "PSFS" / "new.tif"}):
-        write_bytes(tmp_path / "PSFS" / "new.tif", b"a result")
+    with guarded({"psf": psfs, "out": tmp_path / "PSFS" / "new.json"}):
+        write_bytes(tmp_path / "PSFS" / "new.json", b"a result")
+
+
+def test_no_result_becomes_one_more_image_of_a_folder_that_is_read(tmp_path: Path) -> None:
+    """The next reading would take it, or its preview, for one of the PSFs."""
+    stack, link = tmp_path / "stack", tmp_path / "link"
+    stack.mkdir()
+    link.symlink_to(stack)
+    (stack / "a.tif").write_bytes(b"measured")
+    for name in ("new.tif", "new.PNG", "new.ome.zarr"):
+        for folder in (stack, link):
+            with (
+                pytest.raises(FileError, match=r"one more image of .*stack, an input"),
+                guarded({"volume": stack, "out": folder / name}),
+            ):
+                pass
+    for values in (
+        {"volume": stack, "out": stack / "below" / "new.tif"},
+        {"image": stack / "a.tif", "out": stack / "new.tif"},
+        {"scratch": stack, "out": stack / "new.tif"},
+    ):
+        with guarded(values):
+            pass
 
 
 def test_a_checkpoint_that_an_input_was_put_into_is_not_removed_with_it(tmp_path: Path) -> None:
