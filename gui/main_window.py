@@ -20,6 +20,7 @@ from PySide6.QtWidgets import (
     QWidget,
 )
 
+from gui.dock_title import DockTitle
 from gui.help import help_of
 from gui.making import PICTURE_MS, REST_MS, PanelMaker, take_slice
 from gui.panel import Panel
@@ -76,6 +77,7 @@ class MainWindow(QMainWindow):
         self.maker = PanelMaker(session, self._places, self)
         self._panels = self.maker.panels
         self._docks: dict[str, QDockWidget] = {}
+        self._titles: dict[str, DockTitle] = {}
         self._restyling: Generator[str | None] | None = None
         self._kept = Kept(self)
         self._may_close = False
@@ -169,6 +171,8 @@ class MainWindow(QMainWindow):
             dock.setObjectName(f"dock-{name}")
             dock.setWidget(place)
             dock.setToolTip(entry.tip)
+            self._titles[name] = DockTitle(dock)
+            dock.setTitleBarWidget(self._titles[name])
             self.addDockWidget(_AREAS[entry.area], dock)
             if entry.area in first:
                 self.tabifyDockWidget(first[entry.area], dock)
@@ -198,6 +202,7 @@ class MainWindow(QMainWindow):
 
     def _dock_seen(self, name: str, visible: bool) -> None:
         self._places[name].set_seen(visible)
+        self._titles[name].set_seen(visible)
         if visible:
             self.maker.ask_later(name)
 
@@ -225,6 +230,7 @@ class MainWindow(QMainWindow):
         self.strip = StepStrip(self.session)
         self.strip.wanted.connect(self._take_step)
         first = in_row(self.menus, 12, self.simulated, self.chips, None, self.stop_button, spacing=4)
+        first.setContentsMargins(0, 4, 8, 0)
         self._header = fill(QWidget(), first, self.strip, spacing=0)
         self._header.setObjectName("header")
         self.setMenuWidget(self._header)
@@ -248,6 +254,7 @@ class MainWindow(QMainWindow):
             self._add_action(camera, words, keys, partial(self._on_live_panel, what))
         bench = self.menus.addMenu("&Bench")
         self._add_action(bench, "&Another bench…", "Ctrl+O", partial(self.bring, "start"))
+        self._add_action(bench, "The &next step, as the strip says", "Ctrl+Shift+Return", self.strip.go_on)
         for kind in self.session.kinds:
             reconnect = partial(self.session.reconnect, kind)
             self._add_action(bench, f"Reconnect the {name_of(kind)}", "", reconnect)

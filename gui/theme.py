@@ -316,6 +316,9 @@ QLineEdit, QPlainTextEdit, QTextEdit, QListView, QTreeView, QTableView, QComboBo
 QLineEdit:focus, QPlainTextEdit:focus, QListView:focus, QTableView:focus, QComboBox:focus, QComboBox:on {{
   border: 2px solid {c.accent}; padding: 2px 4px; }}
 QLineEdit {{ placeholder-text-color: {c.dim}; }}
+QComboBox {{ padding-left: 7px; }}
+QComboBox:focus, QComboBox:on {{ padding-left: 6px; }}
+QComboBox QLineEdit {{ border: none; background: transparent; padding: 0; }}
 QLineEdit:read-only {{ background: {c.panel}; }}
 QLineEdit:disabled, QComboBox:disabled {{ color: {unused}; border-color: {c.line}; }}
 QLineEdit:disabled {{ placeholder-text-color: {unused}; }}
@@ -346,6 +349,7 @@ QPushButton:focus, QToolButton:focus, QCommandLinkButton:focus {{
 QPushButton:pressed, QPushButton:checked, QToolButton:checked {{
   background: {c.primary}; color: {c.primary_text}; }}
 QPushButton:disabled, QToolButton:disabled {{ color: {unused}; border-color: {c.line}; }}
+QPushButton:checked:disabled, QToolButton:checked:disabled {{ background: {c.line}; }}
 QPushButton::menu-indicator {{ width: 0; }}
 QPushButton:flat, QToolButton[autoRaise="true"] {{ background: transparent; border: 1px solid transparent;
   color: {c.dim}; padding: 2px 6px; }}
@@ -359,7 +363,7 @@ QCommandLinkButton {{ border-radius: 6px; padding: 8px 12px 8px 8px; text-align:
 QCommandLinkButton:focus {{ padding: 7px; }}
 QPushButton#stop {{ background: {c.stop}; color: {c.stop_text}; border: 2px solid {c.stop};
   border-radius: 5px;
-  font-size: {LARGE_PT + 2}pt; font-weight: 800; padding: 4px 24px; letter-spacing: 2px; }}
+  font-size: {LARGE_PT + 2}pt; font-weight: 800; padding: 2px 24px; letter-spacing: 2px; }}
 QPushButton#stop:hover, QPushButton#stop:focus {{ border-color: {c.text}; }}
 QPushButton#primary {{ background: {c.primary}; color: {c.primary_text}; border: 1px solid {c.accent};
   font-weight: 600; padding: 4px 13px; }}
@@ -397,17 +401,21 @@ QTabBar::tab:selected {{ background: palette(base); color: palette(text);
 QTabBar::tab:hover {{ color: palette(text); }}
 QTabBar::tab:selected:focus {{ color: palette(link); border: 2px solid palette(link);
   padding: 5px 11px 3px 11px; }}
-QDockWidget {{ color: palette(placeholder-text); }}
-QDockWidget::title {{ background: palette(alternate-base); padding: 4px 8px; }}
+QWidget#dock-title {{ background: {c.panel}; }}
 QMainWindow::separator {{ background: palette(midlight); width: 3px; height: 3px; }}
 QSplitter::handle:horizontal {{ width: 5px; background: qlineargradient(x1:0, y1:0, x2:1, y2:0, {rule}); }}
 QSplitter::handle:vertical {{ height: 5px; background: qlineargradient(x1:0, y1:0, x2:0, y2:1, {rule}); }}
 QProgressBar {{ background: {c.field}; color: {c.text}; border: 1px solid {c.line}; border-radius: 4px;
   text-align: center; }}
 QProgressBar::chunk {{ background: {c.primary}; border-radius: 3px; }}
+QProgressBar[textVisible="false"] {{ border: none; border-radius: 3px; }}
+QProgressBar[textVisible="false"]::chunk {{ background: {c.accent}; }}
 QHeaderView::section {{ background: {c.panel}; color: {c.dim}; border: none;
   border-bottom: 1px solid {c.line}; padding: 3px; }}
-QHeaderView {{ background: {c.panel}; }}
+QHeaderView, QTableCornerButton::section {{ background: {c.panel}; border: none; }}
+QTableView {{ outline: none; }}
+QTableView::item {{ border-bottom: 1px solid {c.line}; padding: 0 3px; }}
+QTableView::item:selected {{ background: {c.primary}; color: {c.primary_text}; }}
 QScrollBar:vertical {{ background: {c.window}; width: 10px; }}
 QScrollBar:horizontal {{ background: {c.window}; height: 10px; }}
 QScrollBar::handle {{ background: {c.border}; border-radius: 4px; min-height: 24px; min-width: 24px; }}

@@ -119,10 +119,11 @@ class FilmsPanel(Panel):
         shown = fill(QWidget(), (self.view, 1), playing, self.levels)
         about = in_row(self.region_button, self.clear_button, self.quantity, (self.progress, 1), None)
         below = fill(QWidget(), about, (self.plot, 1))
+        self.tools = fill(QWidget(), top)
         self.stack = QStackedWidget()
         self.stack.addWidget(Hint(_EMPTY, "Open…", self._choose))
         self.stack.addWidget(split(shown, below, sizes=[520, 220], down=True, firm=True))
-        fill(self.body, top, (self.stack, 1))
+        fill(self.body, self.tools, (self.stack, 1))
         self._set_usable()
 
     # The film ------------------------------------------------------------------------------------
@@ -325,6 +326,7 @@ class FilmsPanel(Panel):
             self.session.handed_on.emit("tasks", (task, {option: self.film.path}))
 
     def _set_usable(self) -> None:
+        self.tools.setVisible(self.film is not None)  # until then there is one button: the hint's
         for each in (self.export_button, self.play_button, self.region_button, self.clear_button):
             each.setEnabled(self.film is not None)
         self.slider.setEnabled(self.film is not None)

@@ -81,7 +81,9 @@ class ReconstructionsPanel(Panel):
         self.tabs, self.viewers = QTabWidget(), QStackedWidget()
         self.tabs.setDocumentMode(True)
         top = QWidget()
-        below = split()
+        self.below = below = split()
+        """How a result was made; away while there is none."""
+        self.below.hide()
         right = split(top, below, sizes=[520, 170], down=True, stretch=1)
         right.setStretchFactor(0, 3)
         fill(self.body, split(self.tabs, right, sizes=[380, 840], stretch=1))
@@ -92,7 +94,8 @@ class ReconstructionsPanel(Panel):
         self.tabs.addTab(self.results, "Results")
         yield
         tip = "Write all values (.tif, .npy, .ome.zarr), or what is shown (.png)"
-        self.export_button = button("Export…", tip, lambda: self.export.choose(), enabled=False)
+        self.export_button = button("Export…", tip, lambda: self.export.choose())
+        self.export_button.hide()
         tip = "The PSF is turned or of another size for this photograph: fit it first, then reconstruct again"
         self.refine_button = button("Fit the PSF, and again", tip, self.refine)
         self.refine_button.hide()
@@ -182,7 +185,7 @@ class ReconstructionsPanel(Panel):
         self._say_what_is_shown()
         self._show_facts()
         self.convergence.show_histories(result.histories, result.noise_norm)
-        self.export_button.setEnabled(True)
+        self.export_button.show()
         misfit = any(_REFINABLE in warning for warning in result.warnings)
         tried = self.form.options.value("refine_psf")
         self.refine_button.setVisible(misfit and result.path == self._made and not tried)
@@ -212,6 +215,7 @@ class ReconstructionsPanel(Panel):
     ) -> None:
         """Show facts and warnings, which name options of the terminal, as the form has those."""
         said = [(name, self.in_its_words(value)) for name, value in facts]
+        self.below.setVisible(bool(said) or self.result is not None)
         self.facts.show_facts(said, [self.in_its_words(text) for text in warnings], simulated=simulated)
 
     def _say_what_is_shown(self) -> None:
@@ -229,7 +233,7 @@ class ReconstructionsPanel(Panel):
         self._say_what_is_shown()
         self.refine_button.hide()
         self.keep_button.hide()
-        self.export_button.setEnabled(False)
+        self.export_button.hide()
 
     # Export --------------------------------------------------------------------------------------
     def _shown(self) -> dict[str, npt.NDArray[np.uint8]]:
@@ -311,6 +315,7 @@ class ReconstructionsPanel(Panel):
         self.empty.say(words, busy=busy)
         self.viewers.setCurrentWidget(self.empty)
         self.place.clear()
+        self.below.hide()
         self.facts.show_facts([])
         self.convergence.show_histories((), None)
 

@@ -61,8 +61,8 @@ class RunsPanel(Panel):
         """Make what holds the widgets, then those."""
         session = self.session
         left, top, below = QWidget(), QWidget(), QWidget()
-        right = split(top, below, sizes=[480, 260], down=True)
-        fill(self.body, split(left, right, sizes=[640, 560], firm=True))
+        self.details = split(top, below, sizes=[480, 260], down=True)
+        fill(self.body, split(left, self.details, sizes=[640, 560], firm=True))
         self._make_list()
         fill(left, self.where, (self.table, 1), (self.hint, 1), margins=(0, 0, 6, 0))
         yield
@@ -223,6 +223,7 @@ class RunsPanel(Panel):
         self.where.setToolTip(str(folder))
         self.where.setVisible(bool(summaries))
         self.hint.setVisible(not summaries)
+        self.details.setVisible(bool(summaries) or self.opened is not None)
         self.table.setVisible(bool(summaries))
         paths = [listed.path for listed in summaries]
         chosen = paths.index(wanted) if wanted in paths else -1

@@ -113,15 +113,14 @@ class StagePanel(DevicePanel):
         self._grid.setHorizontalSpacing(6)
         self._grid.setColumnStretch(2, 1)
         self._step_row = in_row()
-        pad = in_row((self.pad, 1), self.unlock_button, self.home_button)
         fill(
             self.body,
-            self.state,
+            in_row((self.state, 1), self.unlock_button, self.home_button),
             self._grid,
             self._step_row,
             self.places,
             in_row(None, self.all_button),
-            pad,
+            self.pad,
             None,
         )
         self.watch_device(self.state, ("Home…", self.ask_home))
@@ -151,7 +150,6 @@ class StagePanel(DevicePanel):
             position.setMinimumWidth(110)
             position.setToolTip(f"Where the stage says that {letter} is")
             gauge = share_bar(_GAUGE)
-            gauge.setFixedHeight(6)
             lower, upper = quantity(axis.lower_limit, unit, 6), quantity(axis.upper_limit, unit, 6)
             limits = f"{lower} to {upper}"
             gauge.setToolTip(f"Place between the soft limits: {limits}")

@@ -6,14 +6,23 @@ from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 
-from PySide6.QtCore import QSize
-from PySide6.QtGui import QDragEnterEvent, QDropEvent
-from PySide6.QtWidgets import QCommandLinkButton, QGridLayout, QStackedWidget, QWidget
+from PySide6.QtCore import Qt
+from PySide6.QtGui import QColor, QDragEnterEvent, QDropEvent, QFont, QIcon, QPaintEvent
+from PySide6.QtWidgets import (
+    QCommandLinkButton,
+    QGridLayout,
+    QStackedWidget,
+    QStyle,
+    QStyleOptionButton,
+    QStylePainter,
+    QWidget,
+)
 
 from gui.panel import Panel
 from gui.panels.new_bench import NewBench
 from gui.session import BenchSession
 from gui.session_news import OwnFiles
+from gui.theme import colours
 from gui.widgets.building import fill, in_row, label
 from gui.widgets.dialogues import IMAGES, choose_path
 from instrument.bench.config import BenchConfig
@@ -45,8 +54,34 @@ _TRIED = {
 _WRITTEN = "its bench.toml is written into a folder of its own, with its runs beside it"
 _COLUMNS = 2
 _WIDEST_PX = 900
-_CARD_PX = 64
+_CARD_PX = 70
 """Height of a button: its name and two lines."""
+_INSIDE = (12, 9, -12, -6)
+
+
+class Card(QCommandLinkButton):
+    """A large button: its name, and below it, quieter, what it leads to."""
+
+    def __init__(self, words: str, about: str) -> None:
+        super().__init__(words, about)
+        self.setObjectName("card")
+
+    def paintEvent(self, event: QPaintEvent) -> None:  # noqa: N802 - Qt's name
+        """Paint it: Qt's own goes to the very edge at the right, all of it in one colour."""
+        painter, option = QStylePainter(self), QStyleOptionButton()
+        self.initStyleOption(option)
+        option.text, option.icon = "", QIcon()  # type: ignore[attr-defined]
+        painter.drawControl(QStyle.ControlElement.CE_PushButton, option)
+        inside = self.rect().adjusted(*_INSIDE)
+        named = QFont(self.font())
+        named.setBold(True)
+        painter.setFont(named)
+        painter.setPen(QColor(colours().text))
+        painter.drawText(inside, Qt.AlignmentFlag.AlignTop, self.text())
+        inside.setTop(inside.top() + painter.fontMetrics().lineSpacing() + 2)
+        painter.setFont(self.font())
+        painter.setPen(QColor(colours().dim))
+        painter.drawText(inside, Qt.TextFlag.TextWordWrap, self.description())
 
 
 class StartPanel(Panel):
@@ -118,9 +153,7 @@ class StartPanel(Panel):
     def _card(
         self, name: str, words: str, about: str, tip: str, call: Callable[[], object]
     ) -> QCommandLinkButton:
-        card = QCommandLinkButton(words, about)
-        card.setObjectName("card")
-        card.setIconSize(QSize(0, 0))
+        card = Card(words, about)
         card.setMinimumHeight(_CARD_PX)
         card.setAccessibleDescription(f"{about}. {tip}")
         card.setToolTip(tip)

@@ -50,7 +50,7 @@ def why_not(session: BenchSession, title: str, needs: Sequence[str], tried_on: s
         )
     if tried_on and (wrong := not_tried_on(session.config, needs, tried_on)):
         return (
-            f"{title} takes a simulated {TEMPLATES[tried_on][0]}: the simulated "
+            f"{title} needs a simulated {TEMPLATES[tried_on][0]}: the simulated "
             f"{' and '.join(map(name_of, wrong))} of this bench would see nothing of it."
         )
     return ""

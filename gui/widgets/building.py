@@ -134,6 +134,10 @@ def button(
     return made
 
 
+_HINT_PX = 560
+"""The widest that a sentence of a hint is: longer lines are read badly."""
+
+
 class Hint(QWidget):
     """What stands where there is nothing to be seen yet: one sentence, and one button for what comes next.
 
@@ -157,8 +161,9 @@ class Hint(QWidget):
         super().__init__()
         self.words = hint(words)
         self.words.setContentsMargins(0, 0, 0, 0)
+        self.words.setMaximumWidth(_HINT_PX)
         self.button = button(answer, words or answer, lambda: clicked())
-        parts: list[Part] = [self.words, in_row(None, self.button, None)]
+        parts: list[Part] = [in_row(None, (self.words, 100), None), in_row(None, self.button, None)]
         self._buttons = [self.button]
         if other is not None:
             self.other = button(other[0], words or other[0], lambda: other[1]())
@@ -271,12 +276,17 @@ def narrow(box: QComboBox, characters: int = 5) -> QComboBox:
     return box
 
 
+_BAR_PX = 6
+"""Height of a bar: one as high as a button looks like a button."""
+
+
 class ShareBar(QProgressBar):
-    """A bar without words; while there is no progress its place is empty."""
+    """A thin bar without words; while there is no progress its place is empty."""
 
     def __init__(self, most: int) -> None:
         super().__init__()
         self.setTextVisible(False)
+        self.setFixedHeight(_BAR_PX)
         self.setRange(0, most)
 
     def paintEvent(self, event: QPaintEvent) -> None:  # noqa: N802 - Qt's name
@@ -318,12 +328,17 @@ def table(
     made.setSelectionBehavior(QTableWidget.SelectionBehavior.SelectRows)
     made.setTabKeyNavigation(False)
     made.setCornerButtonEnabled(False)
+    made.setShowGrid(False)
     made.setToolTip(tip)
     made.setAccessibleName(tip or ", ".join(columns))
     made.verticalHeader().setDefaultSectionSize(row_px)
     header = made.horizontalHeader()
     header.setSectionResizeMode(QHeaderView.ResizeMode.ResizeToContents)
+    header.setHighlightSections(False)
     if wide is not None:
+        made.horizontalHeaderItem(wide).setTextAlignment(
+            Qt.AlignmentFlag.AlignLeft | Qt.AlignmentFlag.AlignVCenter
+        )
         header.setSectionResizeMode(wide, QHeaderView.ResizeMode.Stretch)
     return made
 

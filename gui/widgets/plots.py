@@ -24,7 +24,7 @@ from recon.arrays import Array, Float32Array
 pg.setConfigOptions(imageAxisOrder="row-major", antialias=True)
 
 
-_DECIMAL = re.compile(r"-?\d+(\.\d+)?")
+_DECIMAL = re.compile(r"[-−]?\d+(\.\d+)?")
 
 
 class _Plot(pg.PlotWidget):  # type: ignore[misc] # pyqtgraph has no type annotations
@@ -68,9 +68,10 @@ class _Axis(pg.AxisItem):  # type: ignore[misc] # pyqtgraph has no type annotati
 
     def tickStrings(self, values: Sequence[float], scale: float, spacing: float) -> list[str]:  # noqa: N802
         """Return the numbers beside ticks."""
-        if self._places is None:
-            return list(super().tickStrings(values, scale, spacing))
-        return [f"{value * scale:.{self._places}f}" for value in values]
+        texts = super().tickStrings(values, scale, spacing)
+        if self._places is not None:
+            texts = [f"{value * scale:.{self._places}f}" for value in values]
+        return [text.replace("-", "−") for text in texts]
 
 
 class _Counts(_Axis):

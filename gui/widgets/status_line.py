@@ -24,6 +24,7 @@ class StatusLine(QStatusBar):
 
     def __init__(self, session: BenchSession, parent: QWidget | None = None) -> None:
         super().__init__(parent)
+        self.setSizeGripEnabled(False)
         self._session = session
         self.words = label("Ready", yields=True)
         self.words.setContentsMargins(6, 0, 0, 0)

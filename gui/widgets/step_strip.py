@@ -41,7 +41,7 @@ class StepStrip(QFrame):
         self.marks.setAccessibleName("Steps")
         self.words = label(yields=True)
         self.words.setAccessibleName("Next step")
-        self.button = button("", clicked=self._go, primary=True)
+        self.button = button("", clicked=self.go_on, primary=True)
         for part in (self.marks, self.button):
             part.setSizePolicy(QSizePolicy.Policy.Fixed, QSizePolicy.Policy.Preferred)
         self._light = "unknown"
@@ -49,7 +49,7 @@ class StepStrip(QFrame):
         keeps = self.button.sizePolicy()
         keeps.setRetainSizeWhenHidden(True)  # what lies below stays where it is
         self.button.setSizePolicy(keeps)
-        fill(self, self.marks, (self.words, 1), self.button, across=True, margins=(8, 2, 4, 2), spacing=12)
+        fill(self, self.marks, (self.words, 1), self.button, across=True, margins=(9, 3, 8, 3), spacing=12)
         self._reader = NewestOnly(session.jobs, "Looking what is there")
         self._rest = after_rest(self, _REST_MS, self._read)
         session.run_finished.connect(lambda _: self._rest.start())
@@ -98,8 +98,9 @@ class StepStrip(QFrame):
         self.marks.setText("")
         self.look()
 
-    def _go(self) -> None:
-        if self.step is not None:
+    def go_on(self) -> None:
+        """Go where the next step is taken, by its button or its keys."""
+        if self.step is not None and not self.button.isHidden():
             self.wanted.emit(self.step.panel, self.step.what)
 
     def _read(self) -> None:

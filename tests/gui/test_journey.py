@@ -19,6 +19,7 @@ from instrument.runs.inspection import runs_and_photographs
 
 WAIT_MS = 60_000
 GOOD = Facts(light="good")
+_CONTROL_SHIFT = Qt.KeyboardModifier.ControlModifier | Qt.KeyboardModifier.ShiftModifier
 WAYS = {
     "default": ["Connect", "Expose", "Calibrate", "Photograph", "Reconstruct"],
     "display": ["Connect", "Align", "Compute", "Show"],
@@ -105,7 +106,9 @@ def test_the_strip_names_the_next_step_and_leads_there(
     assert window.tabs.currentWidget() is window._places["sweeps"]
     assert sweeps.routine.name == "axial"
     strip.show_facts(replace(GOOD, made=Made(calibration=Path("c"))))
-    strip._go()
+    window.activateWindow()
+    qtbot.waitUntil(window.isActiveWindow)
+    qtbot.keyClick(window, Qt.Key.Key_Return, _CONTROL_SHIFT)
     assert sweeps.routine.name == "photograph"
     job = window.session.exclusive_job("A run", lambda context: context.cancel.wait(WAIT_MS / 1000))
     strip.look()

@@ -226,7 +226,7 @@ def test_closing_while_something_runs_asks_and_then_ends_safely(qtbot: QtBot, wi
 def test_the_layout_is_kept(
     qtbot: QtBot, window: MainWindow, settings: QSettings, make_session: Callable[[], BenchSession]
 ) -> None:
-    window._docks["log"].hide()
+    qtbot.mouseClick(window._titles["log"].away, Qt.MouseButton.LeftButton)
     with qtbot.waitSignal(window.session.closed, timeout=WAIT_MS):
         window.close()
     again = MainWindow(make_session(), settings)

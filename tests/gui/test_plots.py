@@ -9,7 +9,9 @@ from pytestqt.qtbot import QtBot
 from gui.widgets.plots import plot_widget
 
 
-@pytest.mark.parametrize("span", [(24.295, 24.312), (0.0004, 0.0031), (0.0, 1.0), (31.98, 32.02)])
+@pytest.mark.parametrize(
+    "span", [(24.295, 24.312), (0.0004, 0.0031), (0.0, 1.0), (31.98, 32.02), (-0.4, 0.4)]
+)
 def test_all_numbers_of_an_axis_have_the_same_digits(qtbot: QtBot, span: tuple[float, float]) -> None:
     plot = plot_widget("x", "y")
     qtbot.addWidget(plot)
@@ -23,3 +25,4 @@ def test_all_numbers_of_an_axis_have_the_same_digits(qtbot: QtBot, span: tuple[f
     assert len(texts) > 2
     assert len({len(text.partition(".")[2]) for text in texts}) == 1, texts
     assert len(set(texts)) == len(texts)
+    assert not any("-" in text for text in texts), "a minus is as long as everywhere else"
