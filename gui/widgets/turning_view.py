@@ -12,13 +12,14 @@ from PySide6.QtWidgets import QWidget
 
 from gui.background import NewestOnly
 from gui.jobs import Job, JobContext, JobRunner
-from gui.theme import colours, spares_hues, table
+from gui.theme import as_shown, colours, luminance, spares_hues, table
 from gui.widgets.building import button, every, fill, in_row, label, share_bar
 from gui.widgets.entry import quantity
 from gui.widgets.image_view import ArrowKeys
 from gui.widgets.measure import round_length
 from instrument.reconstruction.rendering import Pose, Renderer, depth_shades
-from instrument.volumes.source import VolumeSource
+from instrument.reconstruction.result_figures import Projections, in_colour_of_depth
+from instrument.volumes.source import Plane, VolumeSource
 from recon.arrays import Float64Array
 
 _DRAG_DEG = 0.4
@@ -29,6 +30,7 @@ _FIT = 0.95
 _BAR_SHARE = 0.25
 """Of the view's width, about: the scale bar."""
 _MARGIN_PX = 14
+_FRONT = "From the front: it can be turned once all planes are read"
 
 
 Planes = tuple[Float64Array, Float64Array]
@@ -115,6 +117,20 @@ class TurningView(QWidget):
             self._job = None  # it can be opened again
         self.failed.emit(why)
 
+    def show_front(self, seen: Projections) -> None:
+        """Show the volume from the front, where nothing is to be turned yet."""
+        if self.canvas.renderer is not None:
+            return
+        (levels, colour_map), by_depth = self._looks, self.hues.isChecked()
+
+        def made() -> npt.NDArray[np.uint8]:
+            if not by_depth:
+                return as_shown(seen.front, *levels, colour_map)
+            coloured = in_colours(seen, levels, red=spares_hues(colour_map))
+            return np.asarray(np.round(255 * coloured), np.uint8)
+
+        self.canvas.drawer.ask(made, self.canvas.show_front)
+
     def release(self) -> None:
         """End reading; nothing is shown then."""
         if self._job is not None:
@@ -160,13 +176,16 @@ class TurningCanvas(QWidget):
 
     def __init__(self, jobs: JobRunner, parent: QWidget | None = None) -> None:
         super().__init__(parent)
-        self._drawer = NewestOnly(jobs, "Drawing a volume")
+        self.drawer = NewestOnly(jobs, "Drawing a volume")
+        """Makes the views, one after the other."""
         self.renderer: Renderer | None = None
         self.pose = Pose(30.0, 20.0)
         self.pitch_um: float | None = None
         """Of a lateral voxel of the renderer; None where it is not known."""
         self.pixels: npt.NDArray[np.uint8] | None = None
         """The view that is shown, (height, width, 3)."""
+        self._front: npt.NDArray[np.uint8] | None = None
+        """What is shown before there is a view."""
         self._zoom = 1.0
         self._shown_zoom = 1.0
         self._levels, self._map, self._by_depth = (0.0, 1.0), "grey", True
@@ -185,11 +204,18 @@ class TurningCanvas(QWidget):
     def show_volume(self, renderer: Renderer | None, pitch_um: float | None = None) -> None:
         """Show another volume; None: nothing."""
         self.renderer, self.pitch_um = renderer, pitch_um
-        self._drawer.forget()
+        self.drawer.forget()
         self.pixels = None
+        if renderer is None:
+            self._front = None
         self._zoom = 1.0
         self._make_shades()
         self._ask()
+
+    def show_front(self, front: npt.NDArray[np.uint8]) -> None:
+        """Show a picture (height, width, 3) of the volume until it can be turned."""
+        self._front = front
+        self.update()
 
     def set_looks(self, levels: tuple[float, float], colour_map: str, *, by_depth: bool) -> None:
         """Take other levels, another colour map; ``by_depth``: hues tell the depth."""
@@ -231,10 +257,11 @@ class TurningCanvas(QWidget):
         size = (max(self.height(), 8), max(self.width(), 8))
         zoom = self._zoom * _FIT * min(size) / renderer.extent
         pose, levels, shades = self.pose, self._levels, self._shades
-        self._drawer.ask(lambda: (zoom, renderer.draw(pose, size, zoom, levels, shades)), self._drawn)
+        self.drawer.ask(lambda: (zoom, renderer.draw(pose, size, zoom, levels, shades)), self._drawn)
 
     def _drawn(self, drawn: Any) -> None:
         self._shown_zoom, self.pixels = drawn
+        self._front = None
         self.update()
 
     def _zoomed(self, factor: float) -> None:
@@ -255,6 +282,8 @@ class TurningCanvas(QWidget):
             painter.drawImage(QRectF(self.rect()), image)
             self._draw_bar(painter)
             self._draw_axes(painter)
+        elif self._front is not None:
+            self._draw_front(painter, self._front)
         painter.end()
 
     def resizeEvent(self, event: QResizeEvent) -> None:  # noqa: N802
@@ -282,13 +311,25 @@ class TurningCanvas(QWidget):
         """Zoom."""
         self._zoomed(1.25 ** (event.angleDelta().y() / 120))
 
+    def _draw_front(self, painter: QPainter, front: npt.NDArray[np.uint8]) -> None:
+        """Draw the volume from the front, and that it cannot be turned yet."""
+        height, width = front.shape[:2]
+        image = QImage(front.data, width, height, 3 * width, QImage.Format.Format_RGB888)
+        scale = _FIT * min(self.width(), self.height()) / float(np.hypot(height, width))
+        place = QRectF(0, 0, scale * width, scale * height)
+        place.moveCenter(QRectF(self.rect()).center())
+        painter.fillRect(self.rect(), QColor(0, 0, 0))  # as behind the views to come
+        painter.drawImage(place, image)
+        painter.setPen(_ink())
+        painter.drawText(QPointF(_MARGIN_PX, self.height() - _MARGIN_PX), _FRONT)
+
     def _draw_bar(self, painter: QPainter) -> None:
         """Draw a bar of a round length, with its length; in voxels where no pitch is known."""
         pitch = self.pitch_um or 1.0
         length = round_length(_BAR_SHARE * self.width() / self._shown_zoom * pitch)
         across = length / pitch * self._shown_zoom
         y = self.height() - _MARGIN_PX
-        painter.setPen(QPen(QColor(colours().text), 3))
+        painter.setPen(QPen(_ink(), 3))
         painter.drawLine(QPointF(_MARGIN_PX, y), QPointF(_MARGIN_PX + across, y))
         words = f"{length:g} voxels" if self.pitch_um is None else quantity(length, "um")
         painter.drawText(QPointF(_MARGIN_PX, y - 8), words)
@@ -297,14 +338,32 @@ class TurningCanvas(QWidget):
         """Draw where x, y and z go, in the lower right corner."""
         middle = QPointF(self.width() - 3.5 * _MARGIN_PX, self.height() - 3.5 * _MARGIN_PX)
         to_view = self.pose.matrix
-        painter.setPen(QPen(QColor(colours().text), 1.5))
+        painter.setPen(QPen(_ink(), 1.5))
         for number, name in enumerate("zyx"):
             end = QPointF(to_view[2, number], to_view[1, number])
             painter.drawLine(middle, middle + end * 2 * _MARGIN_PX)
             painter.drawText(middle + end * 2.7 * _MARGIN_PX + QPointF(-3, 4), name)
 
 
+def _ink() -> QColor:
+    """Return what is read on the views' black in each theme."""
+    return QColor(max((colours().text, colours().window), key=luminance))
+
+
 def middle_pitch_um(planes_um: Planes) -> float | None:
     """Return the lateral voxel of the middle plane; None where it is not known."""
     pitch = float(planes_um[1][len(planes_um[1]) // 2])
     return pitch if np.isfinite(pitch) and pitch > 0 else None
+
+
+def in_colours(p: Projections, levels: tuple[float, float], *, red: bool) -> Plane:
+    """Return the front with its depth as colour, float32, (height, width, 3) in 0 to 1.
+
+    ``red``: for eyes used to the dark no channel but that.
+    """
+    low, high = levels
+    shown = in_colour_of_depth(p.front - np.float32(low), p.deepest, len(p.top), max(high - low, 1e-12))
+    if red:
+        shown[..., 0] = shown.max(axis=-1)
+        shown[..., 1:] = 0
+    return shown.astype(np.float32)

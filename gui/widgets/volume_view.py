@@ -20,9 +20,9 @@ from gui.widgets.image_view import StretchedImage, whole_steps
 from gui.widgets.measure import LengthBar, Measure, Region, region_words
 from gui.widgets.plots import LevelsBar, curve_pen, plot_widget
 from gui.widgets.proportions import MOST_BYTES, bytes_in_proportion, in_proportion
-from gui.widgets.turning_view import Planes, TurningView, middle_pitch_um
+from gui.widgets.turning_view import Planes, TurningView, in_colours, middle_pitch_um
 from gui.widgets.volume_tools import Mode, PlaneSlider, VolumeTools
-from instrument.reconstruction.result_figures import Projections, grey, in_colour_of_depth, project
+from instrument.reconstruction.result_figures import Projections, grey, project
 from instrument.volumes.source import Plane, VolumeSource
 from recon.camera.grid import Grid, metric_grid
 
@@ -315,7 +315,7 @@ class VolumeView(QWidget):
         if self.projections is None:
             return {}
         p = self.projections
-        depth = _in_colours(p, self.levels.levels, red=spares_hues(self.levels.colour_map))
+        depth = in_colours(p, self.levels.levels, red=spares_hues(self.levels.colour_map))
         return {"front": p.front, "top": p.top, "side": p.side, "depth": depth}
 
     def restyle(self) -> None:
@@ -399,6 +399,8 @@ class VolumeView(QWidget):
             view.set_colour_map(self.levels.colour_map)
         if self.mode == "turning":
             self.turning.set_looks(self.levels.levels, self.levels.colour_map)
+            if self.projections is not None:
+                self.turning.show_front(self.projections)
         elif self.mode == "slices":
             self._show_slices()
         elif self.projections is not None:
@@ -412,7 +414,7 @@ class VolumeView(QWidget):
         for view, image in others:  # each in a turn of its own; of quick wishes the last is drawn
             QTimer.singleShot(0, view, partial(self._draw_projection, p, view, image, levels))
         self._reader.ask(
-            lambda: _in_colours(p, levels, red=colours_spared),
+            lambda: in_colours(p, levels, red=colours_spared),
             lambda shown: self._draw_projection(p, self.coloured, shown, levels),
             "colours",
         )
@@ -479,16 +481,6 @@ class VolumeView(QWidget):
 
     def _depth_words(self, plane: int) -> str:
         return "" if self._planes is None else f", {self._planes[0][plane] / 1000:.4g} mm"
-
-
-def _in_colours(p: Projections, levels: tuple[float, float], *, red: bool) -> Plane:
-    """Return the front with its depth as colour; ``red``: for eyes used to the dark no channel but that."""
-    low, high = levels
-    shown = in_colour_of_depth(p.front - np.float32(low), p.deepest, len(p.top), max(high - low, 1e-12))
-    if red:
-        shown[..., 0] = shown.max(axis=-1)
-        shown[..., 1:] = 0
-    return shown.astype(np.float32)
 
 
 def _line(view: StretchedImage, angle: int) -> Any:

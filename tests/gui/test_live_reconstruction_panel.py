@@ -22,6 +22,7 @@ from gui.session import BenchSession
 from instrument.files.calibration_file import load_calibration, save_calibration
 from recon.camera.transformed import Transformation, transformed
 from recon.errors import InputError
+from recon.streams.fit import NOT_JUDGED
 from recon.types import Calibration
 
 WAIT_MS = 40_000
@@ -93,7 +94,8 @@ def test_a_picture_of_noise_is_called_so_by_its_own_frame_and_an_old_one_old(
     qtbot: QtBot, window: MainWindow, panel: LiveReconstructionPanel, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     qtbot.waitUntil(lambda: panel._shown is not None and not panel._shown.picture.doubt, timeout=WAIT_MS)
-    assert not panel.view.caution
+    assert panel.view.caution.startswith(NOT_JUDGED)
+    qtbot.waitUntil(lambda: not panel.view.caution, timeout=WAIT_MS)
     session = window.session
     session.bench.scene_off()
     qtbot.waitUntil(lambda: panel.view.caution.startswith("Dark"), timeout=WAIT_MS)

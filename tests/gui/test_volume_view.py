@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 from pathlib import Path
 
 import numpy as np
@@ -12,13 +13,18 @@ from pytestqt.qtbot import QtBot
 
 from gui.jobs import JobRunner
 from gui.panel import whole
+from gui.theme import THEMES, contrast
+from gui.widgets.turning_view import _ink
 from gui.widgets.volume_view import VolumeView
+from instrument.reconstruction.rendering import Renderer
 from instrument.volumes.source import volume_in_memory
 from recon.camera.grid import Grid, metric_volume
 from tests.gui.conftest import WAIT_MS
 
 
-def test_a_volume_is_turned_stepped_through_and_measured(qtbot: QtBot) -> None:
+def test_a_volume_is_turned_stepped_through_and_measured(
+    qtbot: QtBot, monkeypatch: pytest.MonkeyPatch
+) -> None:
     voxels = np.zeros((8, 30, 40), np.float32)
     voxels[5, 10:20, 10:30] = 3.0
     jobs = JobRunner()
@@ -30,9 +36,19 @@ def test_a_volume_is_turned_stepped_through_and_measured(qtbot: QtBot) -> None:
     view.open(volume_in_memory(voxels, Path("volume.npy")), grid)
     assert not view.tools.proportions.isEnabled()  # its voxels are of one size
     qtbot.waitUntil(lambda: view.projections is not None, timeout=WAIT_MS)
+    reading = threading.Event()
+    read = Renderer.of
+    monkeypatch.setattr(Renderer, "of", lambda *given: reading.wait(30) and read(*given))
     view.set_mode("turning")
     canvas = view.turning.canvas
+    qtbot.waitUntil(lambda: canvas._front is not None, timeout=WAIT_MS)
+    assert canvas._front is not None
+    assert canvas._front.shape == (30, 40, 3)
+    assert canvas._front[15, 20].max() > 0, "the front is there until all planes are read"
+    assert canvas.grab().toImage().pixelColor(canvas.rect().center()).value() > 100
+    reading.set()
     qtbot.waitUntil(lambda: canvas.pixels is not None and canvas.pixels.max() > 0, timeout=WAIT_MS)
+    assert canvas._front is None
     assert "red 20 mm" in view.turning.legend.text()
     assert canvas.pitch_um == 25.0
     before, azimuth = view.images["depth"].copy(), canvas.pose.azimuth_deg
@@ -110,3 +126,11 @@ def test_a_perspective_volume_is_shown_in_true_proportions(qtbot: QtBot) -> None
     qtbot.waitUntil(lambda: not jobs.jobs, timeout=WAIT_MS)
     assert closed == [True]
     assert not view.tools.proportions.isEnabled()
+
+
+@pytest.mark.parametrize("theme", list(THEMES))
+def test_scale_bar_and_axes_are_read_on_black_in_every_theme(
+    theme: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("gui.widgets.turning_view.colours", lambda: THEMES[theme])
+    assert contrast(_ink().name(), "#000000") > 4.5
