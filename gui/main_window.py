@@ -10,6 +10,7 @@ from typing import cast
 from PySide6.QtCore import QEvent, QObject, QSettings, QSize, Qt, QTimer
 from PySide6.QtGui import QAction, QCloseEvent, QGuiApplication, QKeyEvent, QKeySequence, QShortcut, QWindow
 from PySide6.QtWidgets import (
+    QAbstractButton,
     QApplication,
     QDockWidget,
     QMainWindow,
@@ -114,7 +115,10 @@ class MainWindow(QMainWindow):
         self.panel("log")  # from the first line on
         self.tabs.currentChanged.connect(self._fill_current)
         self.tabs.currentChanged.connect(self.status.leave_panel)
-        self._fill_current()
+        if session.kinds:
+            self._fill_current()
+        else:  # with the keyboard in it: Return does what comes first
+            self.bring("start")
 
     def change_bench(self, config: BenchConfig) -> None:
         """Close this bench, after asking where something runs, so that another is opened in its place."""
@@ -367,6 +371,16 @@ class MainWindow(QMainWindow):
             return super().focusNextPrevChild(forward)
         to.setFocus(Qt.FocusReason.TabFocusReason if forward else Qt.FocusReason.BacktabFocusReason)
         return True
+
+    def keyPressEvent(self, event: QKeyEvent) -> None:  # noqa: N802 - Qt's name
+        """Have Return press the button that has the keyboard: on some desktops only the space bar does."""
+        now = QApplication.focusWidget()
+        is_return = event.key() in (Qt.Key.Key_Return, Qt.Key.Key_Enter) and not event.isAutoRepeat()
+        held = event.modifiers() & ~Qt.KeyboardModifier.KeypadModifier
+        if is_return and not held and isinstance(now, QAbstractButton):
+            now.click()
+        else:
+            super().keyPressEvent(event)
 
     # What runs -----------------------------------------------------------------------------------
     def _show_simulated(self, _kind: str = "") -> None:

@@ -118,9 +118,10 @@ def test_own_files_are_opened_reconstructed_and_saved_by_keys_alone(
 
     bare.activateWindow()
     qtbot.waitUntil(bare.isActiveWindow, timeout=WAIT_MS)
+    qtbot.waitUntil(start_of(bare).cards["default"].hasFocus, timeout=WAIT_MS)
     card = start_of(bare).cards["files"]
     goes_to(card)
-    qtbot.keyClick(card, Qt.Key.Key_Space)
+    qtbot.keyClick(card, Qt.Key.Key_Return)
     types(tmp_path / "point.tif")
     types(tmp_path / "photo.tif")
     panel = bare.panel("reconstructions")
