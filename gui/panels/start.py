@@ -70,7 +70,7 @@ class Card(QCommandLinkButton):
         """Paint it: Qt's own goes to the very edge at the right, all of it in one colour."""
         painter, option = QStylePainter(self), QStyleOptionButton()
         self.initStyleOption(option)
-        option.text, option.icon = "", QIcon()  # type: ignore[attr-defined]
+        option.text, option.icon = "", QIcon()
         painter.drawControl(QStyle.ControlElement.CE_PushButton, option)
         inside = self.rect().adjusted(*_INSIDE)
         named = QFont(self.font())

@@ -336,9 +336,8 @@ def table(
     header.setSectionResizeMode(QHeaderView.ResizeMode.ResizeToContents)
     header.setHighlightSections(False)
     if wide is not None:
-        made.horizontalHeaderItem(wide).setTextAlignment(
-            Qt.AlignmentFlag.AlignLeft | Qt.AlignmentFlag.AlignVCenter
-        )
+        if (title := made.horizontalHeaderItem(wide)) is not None:
+            title.setTextAlignment(Qt.AlignmentFlag.AlignLeft | Qt.AlignmentFlag.AlignVCenter)
         header.setSectionResizeMode(wide, QHeaderView.ResizeMode.Stretch)
     return made
 
