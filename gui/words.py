@@ -46,8 +46,9 @@ _SIGNS = (
     ),
     (re.compile(rf"{_NO_PATH}led_array(?= opened|:| \({_NO_FOLDER})"), "LED array"),
     (re.compile(rf"{_NO_PATH}slm(?= \({_NO_FOLDER})"), "SLM"),
+    (re.compile(r"\bopen it again\b"), "reconnect it"),
 )
-"""Units and signs as the window's own figures have them; a terminal may lack the letters."""
+"""Units and signs as the window has them, and what its buttons say: a terminal may lack both."""
 
 
 def in_the_window(text: str) -> str:

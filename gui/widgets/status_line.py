@@ -5,16 +5,15 @@ from __future__ import annotations
 from typing import cast
 
 from PySide6.QtCore import QTimer
-from PySide6.QtWidgets import QProgressBar, QStatusBar, QWidget
+from PySide6.QtWidgets import QStatusBar, QWidget
 
 from gui.jobs import Job
 from gui.session import BenchSession
-from gui.widgets.building import label
+from gui.widgets.building import label, share_bar
 from gui.words import in_the_window
 from instrument.bench.config import Kind
 from recon.base.compiling import being_compiled
 
-_MOST_CHARACTERS = 200
 _BAR_PX = 140
 _LOOK_MS = 300
 
@@ -27,9 +26,9 @@ class StatusLine(QStatusBar):
         self.setSizeGripEnabled(False)
         self._session = session
         self.words = label("Ready", yields=True)
-        self.words.setContentsMargins(6, 0, 0, 0)
-        self.progress = QProgressBar()
-        self.progress.setRange(0, 0)
+        self.words.setContentsMargins(3, 0, 0, 0)
+        self.setContentsMargins(6, 0, 8, 0)
+        self.progress = share_bar(0)
         self.progress.setFixedWidth(_BAR_PX)
         self.progress.hide()
         self.compiling = label(role="dim")
@@ -88,7 +87,7 @@ class StatusLine(QStatusBar):
 
     @property
     def _shown_problem(self) -> str:
-        return self._problem.splitlines()[0][:_MOST_CHARACTERS] if self._problem else ""
+        return self._problem.splitlines()[0] if self._problem else ""
 
     def leave_panel(self) -> None:
         """Take away what concerned the panel that was in front: it says so itself, and the log keeps it."""

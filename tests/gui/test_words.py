@@ -35,8 +35,8 @@ _IN_WINDOW = ("recon", "instrument", "calibration_routines")
         ("is no video of 'reconstruct --video'.", "is no video of “Reconstruct a recording” in Files."),
         ("install diffuserbench again", "install diffuserbench again"),
         (
-            "led_array (simulated): was unplugged; slm (simulated) too",
-            "LED array (simulated): was unplugged; SLM (simulated) too",
+            "led_array (simulated): was unplugged; slm (simulated) too. Plug it in, then open it again.",
+            "LED array (simulated): was unplugged; SLM (simulated) too. Plug it in, then reconnect it.",
         ),
         ("3 settings: run the same command again to go on.", "3 settings: “Start” again to go on."),
         ("The same command goes on with the rest.", "“Start” goes on with the rest."),
