@@ -69,7 +69,9 @@ def test_a_look_at_sizes_reads_what_was_noted_as_damaged_and_no_more(tmp_path: P
     whole = chunk.read_bytes()
     chunk.write_bytes(bytes(len(whole)))
     assert Run.open(path).damaged(read=False) == ()
-    assert [one.index for one in Run.open(path).damaged()] == [1]
+    done: list[tuple[int, int]] = []
+    assert [one.index for one in Run.open(path).damaged(lambda *n: done.append(n))] == [1]
+    assert done == [(1, 3), (2, 3), (3, 3)]
     assert [one.index for one in Run.open(path).damaged(read=False, noted=[1, 2])] == [1]
     chunk.write_bytes(whole[:-1])
     assert [one.index for one in Run.open(path).damaged(read=False)] == [1], "its size tells"

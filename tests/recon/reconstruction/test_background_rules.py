@@ -232,6 +232,7 @@ def shade_found(
     given2: float = 25.0,
     needed: float = 0.7,
     rest2: float = 1.0,
+    partly2: float | None = None,
     numbers: Any = NUMBERS,
     psf: Any = None,
     usual2: tuple[float, ...] = (0.0, 0.0),
@@ -254,7 +255,8 @@ def shade_found(
         share = np.log(shade.min()) / np.log(
             shade_of(NUMBERS if numbers is None else numbers, (SIDE, SIDE)).min()
         )
-        return np.full((SIDE, SIDE), (rest2 if needed - 1e-6 <= share <= 1 + 1e-6 else given2) ** 0.5)
+        too_little = given2 if partly2 is None else partly2
+        return np.full((SIDE, SIDE), (rest2 if needed - 1e-6 <= share <= 1 + 1e-6 else too_little) ** 0.5)
 
     monkeypatch.setattr(module, "_shade_fitted", fit)
     monkeypatch.setattr(module, "_shade_left", left)
@@ -264,8 +266,9 @@ def shade_found(
 
 
 def test_of_a_shade_the_least_that_explains_is_taken(monkeypatch: pytest.MonkeyPatch) -> None:
-    found, fitted = shade_found(monkeypatch, usual2=(0.0, 0.0))
-    np.testing.assert_allclose(found, 0.75 * NUMBERS)  # in sixteenths
+    found, fitted = shade_found(monkeypatch, needed=0.65)
+    np.testing.assert_allclose(found, 11 / 16 * NUMBERS)
+    np.testing.assert_allclose(shade_found(monkeypatch, needed=0.65, partly2=1.5)[0], 11 / 16 * NUMBERS)
     assert fitted == [(0, 1.0)]
     _, fitted = shade_found(monkeypatch, usual2=(0.0, 0.5))
     assert fitted == [(1, 1.5)], "the channel of most contrast"
@@ -350,13 +353,16 @@ def test_nothing_is_looked_for_in_volumes(monkeypatch: pytest.MonkeyPatch) -> No
     assert not looked_at(problem, monkeypatch)
 
 
-@pytest.mark.parametrize(("share", "looks"), [(1.0, True), (0.3, False)])
+@pytest.mark.parametrize(("every", "looks"), [(None, True), (10, True), (3, False)])
 def test_nothing_is_looked_for_where_erased_pixels_leave_no_small_copy(
-    share: float, monkeypatch: pytest.MonkeyPatch, *, looks: bool
+    every: int | None, monkeypatch: pytest.MonkeyPatch, *, looks: bool
 ) -> None:
-    rng = np.random.default_rng(0)
-    image, psf = rng.random((2, 260, 20), np.float32)
-    measurement = Measurement(image, noise=0.1, erasures=rng.random(image.shape) >= share)
+    """One pixel is erased in each square of so many a side: of ten, squares of two are whole as a rule."""
+    image, psf = np.random.default_rng(0).random((2, 260, 20), np.float32)
+    erased = np.zeros(image.shape, bool)
+    if every is not None:
+        erased[::every, ::every] = True
+    measurement = Measurement(image, noise=0.1, erasures=erased)
     assert looked_at(Problem.of(measurement, psf, ReconstructionOptions()), monkeypatch) is looks
 
 
@@ -404,6 +410,7 @@ def test_nothing_is_restored_where_nothing_lacks_or_nothing_explains_it(
 
 
 def test_an_offset_is_added_in_counts_and_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    assert restored(monkeypatch, share=0.1, mean=0.5)[1].measurement.background == -0.05
     before, after = restored(monkeypatch, share=0.1)
     assert after.measurement.background == -5.0
     assert after.measurement.found["added_counts"] == 5.0

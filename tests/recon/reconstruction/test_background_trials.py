@@ -74,7 +74,7 @@ def tried(
         image[tuple(np.argwhere(VALID)[0])] = least
         solution = np.full((1, planes, 6, 8), 9.0)
         solution[0, :, 1:5, 2:7] = 0.0
-        solution[0, :, 1:2, 2:7] = 1.0
+        solution[0, :, 1:2, 2:7], solution[0, :, 2:3, 2:7] = 3.0, 0.3
         return SimpleNamespace(
             background=image[None], solution=solution, left="lit" if coarse.smooth else "plain", weight=0.25
         )
