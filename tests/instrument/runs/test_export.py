@@ -83,6 +83,7 @@ def test_tiff(run: Run, tmp_path: Path, name: str) -> None:
     assert np.array_equal(tifffile.imread(tmp_path / name), frames_of(run))
     with tifffile.TiffFile(tmp_path / name) as tiff:
         assert tiff.is_ome == (".ome" in name)
+        assert not tiff.is_bigtiff, "which fewer programs read"
         if tiff.is_ome:
             assert 'PhysicalSizeX="6.5"' in tiff.ome_metadata
             assert 'TimeIncrement="0.05"' in tiff.ome_metadata
@@ -117,6 +118,10 @@ def test_ome_tiff_tells_when_and_where_each_frame_was_taken(tmp_path: Path) -> N
     np.testing.assert_array_equal(
         tifffile.imread(tmp_path / "a.ome.tif"), [image(i, False) for i in range(3)]
     )
+    export(run, tmp_path / "a.mp4")
+    video = cv2.VideoCapture(str(tmp_path / "a.mp4"))
+    assert video.get(cv2.CAP_PROP_FPS) == pytest.approx(10, rel=0.02), "a plan's frames have no rate"
+    video.release()
     # The frames' own OME-Zarr says the same.
     group = zarr.open_group(run.path / "frames.ome.zarr", mode="r")
     multiscale = Image.from_zarr(group).ome_attributes.multiscales[0]

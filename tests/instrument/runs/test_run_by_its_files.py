@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -147,6 +148,15 @@ def test_what_a_newer_program_noted_in_a_plan_is_said_to_be_left_out(
     assert "'mood', which this program does not know" in caplog.text
 
 
+def test_images_that_were_deleted_meanwhile_are_not_begun_anew(tmp_path: Path) -> None:
+    with new_run(tmp_path) as writer:
+        writer.write([frame(0)])
+        shutil.rmtree(writer.path / "frames.ome.zarr")
+        with pytest.raises(RunError, match="deleted or moved meanwhile"):
+            writer.write([frame(1)])
+        assert not (writer.path / "frames.ome.zarr").exists()
+
+
 def test_an_array_grows_with_the_first_frame_beyond_it(tmp_path: Path) -> None:
     with RunWriter.create(tmp_path, label="r", bench=BENCH) as writer:
         writer.write([frame(0)])
@@ -194,6 +204,9 @@ def test_no_run_is_kept_within_another(tmp_path: Path, within: str) -> None:
     with pytest.raises(RunError, match="no other run is kept there") as refused:
         refuse_within(path / within)
     assert f"e.g. {tmp_path}" in str(refused.value)
+    with pytest.raises(RunError, match="no other run is kept there"):
+        new_run(path / within)
+    assert [one.name for one in path.glob("*/")] == ["frames.ome.zarr"]
     refuse_within(tmp_path / within)
     (path / "log.jsonl").unlink()
     refuse_within(path / within)

@@ -62,6 +62,14 @@ def test_one_depth_is_the_camera_of_one_depth():
     assert deep.norm_bound == pytest.approx(flat.norm_bound)
 
 
+@pytest.mark.parametrize("n_z", [1, 3])
+def test_power_is_that_of_the_psfs_transforms(n_z):
+    psfs = np.random.default_rng(4).random((n_z, 2, 5, 4))
+    camera = Convolution(psfs, (6, 7), dtype=np.float64)
+    expected = np.sum(np.abs(np.fft.rfft2(psfs, camera.grid_shape)) ** 2, axis=0)
+    np.testing.assert_allclose(camera.power(), expected)
+
+
 @pytest.mark.parametrize("n_z", [1, 2, 4])
 def test_norm_bound_holds(n_z):
     operator = Convolution(np.random.default_rng(4).random((n_z, 1, 8, 8)), (8, 8), dtype=np.float64)

@@ -210,6 +210,8 @@ def test_functions_of_the_field_are_orthonormal_over_the_beads_and_stay_what_the
     np.testing.assert_allclose(values[:, 0], 1)
     middle = functions.at(beads[[0, 3]].mean(axis=0)[None])
     np.testing.assert_allclose(middle[0], values[[0, 3]].mean(axis=0), atol=1e-12)
+    quarter = functions.at(np.array([[4.0, -30.0]]))
+    np.testing.assert_allclose(quarter[0], 0.75 * values[0] + 0.25 * values[1], atol=1e-12)
     beyond = functions.at(np.array([[99.0, -20.0], [5.0, -99.0]]))
     np.testing.assert_allclose(beyond, functions.at(np.array([[10.0, -20.0], [5.0, -30.0]])), atol=1e-12)
 
@@ -234,3 +236,15 @@ def test_a_point_at_the_sensors_edge_is_found_though_its_light_and_place_tell_th
     np.testing.assert_allclose(place, [-16.2, 3.0], atol=0.01)
     assert light == pytest.approx(5, rel=0.02)
     assert np.linalg.norm(left) < 0.01 * np.linalg.norm(image)
+
+
+def test_a_point_that_the_sensor_does_not_see_stays_as_it_is() -> None:
+    place, light = _refined(camera(), np.ones(SENSOR, np.float32), np.array([99.0, 0.0]), 2.0)
+    assert (*place, light) == (99, 0, 2)
+
+
+def test_a_blobs_place_is_its_centroid_along_each_side() -> None:
+    beads = np.zeros((40, 50))
+    beads[20, 30], beads[20, 31], beads[21, 30] = 6.0, 3.0, 1.0
+    (found,) = listed(points_on_grid(beads, (20, 25)))
+    assert found == pytest.approx((0.1, 5.3, 10.0))

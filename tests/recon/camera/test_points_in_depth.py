@@ -45,6 +45,15 @@ def test_planes_are_counted_evenly_in_the_inverse_of_depth_and_beyond(descending
     np.testing.assert_array_equal(made.within(places), [[-0.5, 7, -8], [1.2, 7, -8], [3.5, 0, 0]])
 
 
+def test_between_uneven_depths_planes_are_counted_evenly_in_the_inverse() -> None:
+    z_um = np.array([1e4, 1.4e4, 2e4, 2.1e4])
+    made = camera(z_um)
+    for plane, first, share in ((0.5, 0, 0.5), (1.25, 1, 0.25), (2.5, 2, 0.5), (3, 2, 1), (3.5, 2, 1.5)):
+        near = (1 - share) / z_um[first] + share / z_um[first + 1]
+        assert made.depth_um(plane) == pytest.approx(1 / near)
+        assert made.plane_of(1 / near) == pytest.approx(plane)
+
+
 @pytest.mark.parametrize("descending", [False, True])
 @pytest.mark.parametrize(("plane", "off"), [(0.0, 2e-3), (2.0, 2e-3), (0.5, 0.08), (1.6, 0.08), (2.25, 0.08)])
 def test_a_point_between_planes_looks_like_one_there(plane: float, off: float, descending: bool) -> None:

@@ -169,11 +169,10 @@ def test_channels_are_judged_together_and_then_tried_to_the_end(
     assert asked == [True] * n_channels
 
 
-@pytest.mark.parametrize("of_psf", [1, 3])
-def test_a_channel_on_few_pixels_has_its_own_counts_and_psf(of_psf: int) -> None:
-    image = (np.array([1, 5, 9]) + np.array([0.1, 0.2, 0.4]) * RNG.normal(size=(40, 48, 3))).astype(
-        np.float32
-    )
+@pytest.mark.parametrize(("of_psf", "channels"), [(1, 3), (2, 2), (3, 3)])
+def test_a_channel_on_few_pixels_has_its_own_counts_and_psf(of_psf: int, channels: int) -> None:
+    image = np.array([1, 5, 9]) + np.array([0.1, 0.2, 0.4]) * RNG.normal(size=(40, 48, 3))
+    image = image[..., :channels].astype(np.float32)
     psfs = RNG.random((1, of_psf, 40, 48)).astype(np.float32) ** 8
     calibration = Calibration(psfs, np.full((1, 3), np.nan), background=np.ones((of_psf, 40, 48), np.float32))
     erased = np.zeros((40, 48), bool)

@@ -21,6 +21,7 @@ from recon.solvers.prior_splits import balancing
 from recon.solvers.splitting import Room, SensorData, Tuning, is_due, residual_norm
 from recon.solvers.tv_admm_volume import LeanTotalVariation, volume_solver
 from recon.solvers.volume_admm import FIRST_PENALTY, VolumeAdmm, is_lateral_periodic
+from tests.device import LIBRARY, played
 
 SENSOR = (7, 8)
 RNG = np.random.default_rng(5)
@@ -324,6 +325,20 @@ def test_a_solvers_state_lives_in_its_room() -> None:
     device: Any = Elsewhere()
     assert Room(storage=disk).zeros((2, 3), np.float32) == (disk, (2, 3), np.dtype(np.float32))
     assert Room(xp=device, storage=disk).zeros((2, 3), np.float32) == (device, (2, 3), np.dtype(np.float32))
+
+
+def test_what_a_start_casts_on_a_device_is_what_it_casts_on_the_host() -> None:
+    start = RNG.random(CAMERA.domain_shape)
+    with played():
+        host, device = (
+            VolumeAdmm(CAMERA, SensorData(DATA, VALID), volume_tv(), initial=start, room=room)
+            for room in (Room(), Room(xp=LIBRARY))
+        )
+        for _ in range(3):
+            one, other = host.advance(), device.advance()
+            assert other.objective == pytest.approx(one.objective)
+            assert other.primal_residual == pytest.approx(one.primal_residual)
+        np.testing.assert_allclose(device.solution, host.solution, atol=1e-9)
 
 
 def test_a_volumes_solver_takes_one_channel() -> None:

@@ -227,6 +227,31 @@ def test_what_is_unexplained_is_named_with_no_gain_where_it_alone_decided_and_no
     assert (near.region, [finding.stress for finding in near.findings]) == (Region.NEAR, ["load"])
 
 
+def test_what_limits_is_said_of_what_is_not_reliable_and_one_thing_sets_apart() -> None:
+    good = judged(Told(0.1, load=0.1), load=0.5)
+    assert (good.region, len(good.findings), len(good.sentences)) == (Region.INSIDE, 1, 1)
+    told = Told(0.1)
+    told.distance = lambda place: 5 * float(np.sum(np.abs(place - told.typical)))  # type: ignore[method-assign]
+    apart = judged(told, load=0.5, unexplained=0.3)
+    assert len(apart.findings) > 1
+    said = [sentence for sentence in apart.sentences if sentence.startswith("What sets it apart")]
+    assert len(said) == 1
+    assert apart.findings[0].words in said[0]
+
+
+@pytest.mark.parametrize("region", [Region.INSIDE, Region.NEAR, Region.UNKNOWN])
+def test_a_psf_that_is_cut_makes_a_reliable_picture_doubtful_and_no_other(region: Region) -> None:
+    before = judged(Told(0.1, load=0.1), load=0.5)
+    verdict = Verdict(region, "admm tv", 0.1, before.findings, before.evidence, before.basis)
+    after = verdict.with_cut_psf(0.31)
+    if region is not Region.INSIDE:
+        assert after is verdict
+        return
+    assert (after.region, after.findings) == (Region.NEAR, ())
+    assert after.sentences[0].startswith("doubtful: the PSF seems to go on beyond the sensor's edges")
+    assert "up to 31% of its light" in after.sentences[0]
+
+
 def test_names_of_methods_are_the_maps() -> None:
     assert judge.method_name("wiener", "l1", volume=True) == "wiener"
     assert judge.method_name("fista", "tv-isotropic") == "fista tv"
