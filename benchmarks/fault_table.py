@@ -2,6 +2,7 @@
 
     python benchmarks/fault_table.py                       every call, every fault, all work: hours
     python benchmarks/fault_table.py --every 7 run snap    a sample
+    python benchmarks/fault_table.py align --first 60 --every 9    at once, without the whole work before
 
 Each trial is a process of its own that carries out a command of the terminal on the simulated bench, or a
 live session of eight pictures from Python. The device call with the trial's number (counted at the driver,
@@ -101,6 +102,8 @@ DISPLAY = {
 """What makes the display's bench small."""
 SOON_S = 2.0
 """What the waits for a device that hangs are shortened to."""
+PATIENCE_S = 600.0
+"""How long the work without a fault may take."""
 HELD_UP_S, END_S = 7.0, 25.0
 """When a trial gets Ctrl-C, and when it is killed, beside three times what the work takes without a fault."""
 
@@ -288,7 +291,12 @@ def trial(work: str, number: int, fault: str, folder: Path, longer_s: float) -> 
             sys.stdout.flush()
             sys.stderr.flush()
             os._exit(code)
-    status, held_up = _wait(process, longer_s)
+    try:
+        status, held_up = _wait(process, longer_s)
+    except BaseException:  # the table is ended: nothing goes on in a folder that is removed
+        os.kill(process, signal.SIGKILL)
+        os.waitpid(process, 0)
+        raise
     said = (folder / "err").read_text() if (folder / "err").is_file() else ""
     calls, lit, moving = [], True, True
     if (folder / "state").is_file():
@@ -333,13 +341,18 @@ def _run_in(folder: Path) -> str:
     return f"{run.condition}, unsound" if whole else str(run.condition)
 
 
-def table(work: str, faults: list[str], every: int, seed: int, folder: Path) -> Counter[str]:
-    """Print a row for each fault at each chosen call; return how often each judgement was made."""
-    began_s = time.monotonic()
-    whole, calls = trial(work, -1, "none", folder, 600.0)
-    longer_s = 3 * (time.monotonic() - began_s)
-    if whole.code != 0 or whole.light != "off":
-        raise SystemExit(f"{work} itself failed ({whole.code}):\n{whole.said}")
+def table(work: str, faults: list[str], every: int, seed: int, among: int, folder: Path) -> Counter[str]:
+    """Print a row for each fault at each chosen call; return how often each judgement was made.
+
+    ``among`` the first so many calls only, without the whole work before (0: among all).
+    """
+    calls, longer_s = [""] * among, PATIENCE_S
+    if not among:
+        began_s = time.monotonic()
+        whole, calls = trial(work, -1, "none", folder, PATIENCE_S)
+        longer_s = 3 * (time.monotonic() - began_s)
+        if whole.code != 0 or whole.light != "off":
+            raise SystemExit(f"{work} itself failed ({whole.code}):\n{whole.said}")
     first = random.Random(seed).randrange(every)
     counts: Counter[str] = Counter()
     for number in range(first, len(calls), every):
@@ -364,6 +377,7 @@ def run(arguments: list[str] | None = None) -> int:
     parser.add_argument("work", nargs="*", choices=[*WORK, []], help="commands [default: all]")
     parser.add_argument("--every", type=int, default=1, help="of so many calls one")
     parser.add_argument("--seed", type=int, default=0, help="which of them")
+    parser.add_argument("--first", type=int, default=0, help="among the first so many calls [default: all]")
     parser.add_argument("--fault", action="append", choices=FAULTS, help="faults [default: all]")
     asked = parser.parse_args(arguments)
     counts: Counter[str] = Counter()
@@ -374,7 +388,7 @@ def run(arguments: list[str] | None = None) -> int:
         with contextlib.chdir(folder), quiet[0], quiet[1]:
             main(WORK["snap"])  # what is imported and compiled here, no trial waits for
         for work in asked.work or WORK:
-            counts += table(work, asked.fault or list(FAULTS), asked.every, asked.seed, folder)
+            counts += table(work, asked.fault or list(FAULTS), asked.every, asked.seed, asked.first, folder)
     return 1 if set(counts) - {"ok", "harmless", "held up"} else 0
 
 
