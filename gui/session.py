@@ -112,6 +112,7 @@ class BenchSession(QObject):
         logging.getLogger().addHandler(self._handler)
         for room in ("instrument", "drivers", "calibration_routines"):
             logging.getLogger(room).setLevel(logging.INFO)
+        self._hung: DeviceError | None = None
         self._watch = QTimer(self)
         self._watch.setInterval(_WATCH_MS)
         self._watch.timeout.connect(self._look_after_devices)
@@ -310,8 +311,9 @@ class BenchSession(QObject):
                     self.stop(f"the {name_of(kind)} does not answer")  # nor is it known what it does
 
     def _look_after_devices(self) -> None:
-        """Notice a stream that ended by an error, and devices that were lost while nobody used them."""
-        error = self.live.error
+        """Notice a stream that ended or hangs, and devices that were lost while nobody used them."""
+        hung, self._hung = self._hung, self.live.hangs  # at two looks: all may have stood still
+        error = self.live.error or (self._hung if hung else None)
         if error is not None and self.is_open("camera"):
             self.log("error", f"Live view: {words_for(error)}")
             self.note_failure(error, surely=True)

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 from drivers.camera import Camera
 from drivers.common.stream import FrameStream
-from drivers.errors import DeviceError
+from drivers.errors import DeviceError, DeviceTimeoutError
 from drivers.frame import Frame
 from instrument.bench.safety import note_failures
 from instrument.live.frame_view import Counts
@@ -119,6 +119,16 @@ class LiveCamera:
         """What ended the stream, if it was not ``stop``."""
         stream = self._stream
         return None if stream is None else stream.error
+
+    @property
+    def hangs(self) -> DeviceTimeoutError | None:
+        """That the stream's driver has not come back from waiting for a frame: nobody here waits with it."""
+        try:
+            if (stream := self.stream) is not None:
+                stream.require_answer()
+        except DeviceTimeoutError as error:
+            return error
+        return None
 
     @contextmanager
     def watching(self, newest: Callable[[], Frame | None]) -> Iterator[None]:

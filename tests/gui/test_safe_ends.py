@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from pytestqt.qtbot import QtBot
 
+from drivers.simulated.camera import SimulatedCamera
 from drivers.simulated.slm import SimulatedSlm
 from gui.jobs import JobContext, JobState
 from gui.session import BenchSession
@@ -151,6 +152,23 @@ def test_a_device_that_does_not_answer_stops_everything(
     assert not session.bench.source_lit
     assert "STOP: the SLM does not answer." in lines
     assert session.state("slm").condition == "failed"
+    answers.set()
+
+
+def test_a_camera_that_hangs_in_the_live_view_is_named_and_the_light_put_out(
+    qtbot: QtBot, session: BenchSession, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    answers, stream = threading.Event(), session.live.stream
+    assert stream is not None
+    monkeypatch.setattr(SimulatedCamera, "next_frame", lambda *_: answers.wait(WAIT_MS / 1000))
+    stream._answer_limit_s = 0.5
+    session.bench.source_on()
+    with qtbot.waitSignal(session.stopped, timeout=WAIT_MS):
+        pass
+    assert not session.bench.source_lit
+    state = session.state("camera")
+    assert state.condition == "failed"
+    assert "camera (simulated): hangs" in state.text
     answers.set()
 
 
