@@ -13,7 +13,7 @@ from PySide6.QtCore import QObject, Qt, Signal
 from PySide6.QtWidgets import QWidget
 
 from calibration_routines.display.spot_camera import SpotLook
-from calibration_routines.plan_procedures import unfinished
+from calibration_routines.plan_procedures import ResumeProcedure, unfinished
 from calibration_routines.planned import place_of
 from calibration_routines.procedure import Listener, Outcome, Procedure
 from calibration_routines.psf.sweep_plan import SweepExposures
@@ -198,6 +198,8 @@ class ProcedureRun(QObject):
         Raises BusyError when something else holds the bench.
         """
         control, mailbox, bench = RunControl(), _Mailbox(), self._session.bench
+        resumed = procedure.run if isinstance(procedure, ResumeProcedure) else None
+        mailbox.left = resumed  # until it has begun: it may be refused, for want of room say, or withdrawn
 
         def work(context: JobContext) -> Outcome | Ended:
             context.on_cancel(lambda: threading.Thread(target=control.stop, name="STOP").start())
@@ -208,9 +210,9 @@ class ProcedureRun(QObject):
                 return Ended(words, unfinished(error.run.path))
             except EndedEarlyError as error:
                 words = "\n".join([str(error), *getattr(error, "__notes__", ())])
-                return Ended(words, unfinished(control.run))
+                return Ended(words, unfinished(control.run or resumed))
             except BaseException:
-                mailbox.left = unfinished(control.run)
+                mailbox.left = unfinished(control.run or resumed)
                 raise
 
         self._job = job = self._session.exclusive_job(title, work)

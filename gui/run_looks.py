@@ -89,7 +89,7 @@ def _picture(what: str, image: Array, metadata: FrameMetadata) -> Picture:
     words = [
         what,
         f"{metadata.utc.astimezone():%H:%M:%S}",  # the run's name has the day
-        f"{metadata.exposure_ms:.4g} ms",
+        quantity(metadata.exposure_ms, "ms"),
         f"LEDs: {metadata.led_pattern}" if metadata.led_pattern else "",
     ]
     place = ", ".join(_axis_words(axis, value) for axis, value in (metadata.stage_position or {}).items())

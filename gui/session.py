@@ -22,6 +22,7 @@ from gui.background import NewestOnly
 from gui.jobs import BusyError, Job, JobContext, JobRunner, Work, joined, words_for
 from gui.live_upkeep import LiveUpkeep
 from gui.session_news import DeviceState, LogBridge, OperatorRequest, is_gone, name_of
+from gui.widgets.entry import quantity
 from gui.words import in_the_log, in_the_window
 from instrument.bench.bench import Bench
 from instrument.bench.config import BenchConfig, Kind
@@ -266,7 +267,7 @@ class BenchSession(QObject):
         ago = timedelta(microseconds=(time.monotonic_ns() - frame.host_time_ns) / 1e3)
         words = [
             f"{datetime.now() - ago:%H:%M:%S}",
-            f"{frame.exposure_ms:.4g} ms",
+            quantity(frame.exposure_ms, "ms"),
             f"light: {lit or frame.led_pattern or 'not known'}",
         ]
         return ", ".join([*words, "SIMULATED"] if self.state("camera").simulated else words)

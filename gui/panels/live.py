@@ -294,6 +294,8 @@ class LivePanel(Panel):
             return True
         frame, state = self.picture.frame, self.form.state
         longest_s = self._exposure_ms / 1e3
+        if not self.session.live.is_running:  # another job has the camera: nothing is waited for
+            self._came_s = time.monotonic()
         seconds = time.monotonic() - self._came_s
         if not self.session.live.is_running or seconds < _PATIENCE_S + 3 * longest_s:
             return False

@@ -104,7 +104,8 @@ class StagePanel(DevicePanel):
         self.unlock_button.hide()
         self._here: dict[str, float] | None = None
         """Where the stage said that it is."""
-        self.places = KeptBar(session, "places", "Places", lambda: self._here, self._go_to, "Go")
+        self._is_homed = False
+        self.places = KeptBar(session, "places", "Places", self._place_to_keep, self._go_to, "Go")
         tip = "Make a plan that takes a frame of the lit scene at every place: look at it, then start it"
         self.all_button = button("Photograph all places…", tip, self.photograph_all)
         session.kept_changed.connect(self._places_changed)
@@ -202,7 +203,7 @@ class StagePanel(DevicePanel):
     def _show(self, reading: tuple[bool, dict[str, float], bool, bool]) -> None:
         is_moving, position, is_homed, is_locked = reading
         self.unlock_button.setVisible(is_locked)
-        self._here = position
+        self._here, self._is_homed = position, is_homed
         for name, row in self.rows.items():
             here = position[name]
             row.position.setText(_place(here, row.target.shown_unit))
@@ -237,6 +238,14 @@ class StagePanel(DevicePanel):
         delta = steps * (field.value or 0.0)
         words = f"Jog {letter} by {quantity(delta, row.axis.unit, 6)}"
         self._start(words, {row.axis.name: delta}, relative=True)
+
+    def _place_to_keep(self) -> dict[str, float] | None:
+        """Return where the stage is; None, and why, where that has no reference."""
+        if not self._is_homed:
+            self.refused(self.places.save_button, "Not homed: a place would mean nothing. Home it first.")
+            return None
+        self.accepted(self.places.save_button)
+        return self._here
 
     def _go_to(self, name: str, place: dict[str, float]) -> None:
         self._start(f"Move to {name}", place, relative=False)

@@ -180,14 +180,18 @@ class CameraForm(QWidget):
         except BusyError as error:
             self._refuse(name, str(error))
             return None
-        job.succeeded.connect(lambda state: self._taken(name, state))
+        region = value if name == "roi" else None
+        job.succeeded.connect(lambda state: self._taken(name, state, region))
         job.failed.connect(lambda why: self._refuse(name, why))
         return job
 
-    def _taken(self, name: str, state: CameraState) -> None:
+    def _taken(self, name: str, state: CameraState, asked: Roi | None = None) -> None:
         widget = self.widgets[name]
         if not isValid(widget):
             return
+        if name == "roi" and asked is not None and asked != state.roi:
+            now, wanted = (", ".join(map(str, region.as_tuple())) for region in (state.roi, asked))
+            self._session.log("info", f"The camera reads region {now}, the nearest to {wanted}.")
         self._panel.accepted()  # what Auto could not do in the settings before is over, too
         if isinstance(widget, QLineEdit):
             widget.setModified(False)

@@ -80,6 +80,7 @@ class DeviceSettings(TextWindow):
         self._show(read)
         own = read[1]
         if not own:
+            self._say("Its driver has no further settings that can be changed here.")
             return
         form = QFormLayout()
         for name, setting in own.items():

@@ -289,7 +289,10 @@ class NumberEdit(Refusing):
         except ValueError:
             factor = None
         if factor is None:
-            return None, f"{text!r} is no number{f' of {self.shown_unit}' if self.unit else ''}."
+            return (
+                None,
+                f"{text!r} is no number{f' of {self.shown_unit}' if self.unit not in ('', '×') else ''}.",
+            )
         # 2 cm are 20 mm, not 20.000000000000004.
         number = float(f"{number * factor:.15g}")
         if not math.isfinite(number):

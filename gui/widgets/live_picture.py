@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 import pyqtgraph as pg
@@ -134,9 +134,11 @@ class ProfileLine(_Overlay):
         if self.item is None:
             return
         ends = self._places()
-        for end in ends[1:] if end_only else ends:
-            end.setX(end.x() + _STEP_PX * across)
-            end.setY(end.y() + _STEP_PX * down)
+        moved = ends[1:] if end_only else ends
+        dx, dy = _within(self._view, moved, moved, across, down)
+        for end in moved:
+            end.setX(end.x() + dx)
+            end.setY(end.y() + dy)
         for handle, end in zip(self.item.handles, ends, strict=True):
             self.item.movePoint(handle["item"], end)
 
@@ -200,12 +202,14 @@ class RegionBox(_Overlay):
         """Move the rectangle by steps of the arrow keys, or its lower right corner."""
         if self.item is None:
             return
-        dx, dy = _STEP_PX * across, _STEP_PX * down
+        width, height = self.item.size()
+        place = self.item.pos()
+        corner = place + pg.Point(width, height)
+        dx, dy = _within(self._view, [corner if size_only else place], [corner], across, down)
         if size_only:
-            width, height = self.item.size()
             self.item.setSize((max(_LEAST_PX, width + dx), max(_LEAST_PX, height + dy)))
         else:
-            self.item.setPos(self.item.pos() + pg.Point(dx, dy))
+            self.item.setPos(place + pg.Point(dx, dy))
 
     @property
     def rectangle(self) -> tuple[float, float, float, float] | None:
@@ -214,6 +218,21 @@ class RegionBox(_Overlay):
             return None
         place, size = self.item.pos(), self.item.size()
         return place.x(), place.y(), size.x(), size.y()
+
+
+def _within(
+    view: ImageView, first: Sequence[Any], last: Sequence[Any], across: float, down: float
+) -> tuple[float, float]:
+    """Return what steps of the arrow keys move places by, in pixels: not out of the image.
+
+    ``first`` are the places that reach its left and upper edge, ``last`` the right and lower one.
+    """
+    if view.image is None:
+        return 0.0, 0.0
+    height, width = view.image.shape[:2]
+    dx = min(_STEP_PX * across, width - max(place.x() for place in last))
+    dy = min(_STEP_PX * down, height - max(place.y() for place in last))
+    return max(dx, -min(place.x() for place in first)), max(dy, -min(place.y() for place in first))
 
 
 LEVELS = {"full range": None, "0.1 – 99.9 %": (0.1, 99.9), "1 – 99 %": (1.0, 99.0), "by hand": None}

@@ -284,3 +284,33 @@ def test_without_the_point_source_nothing_is_lit_but_the_scene_is_darkened(
     qtbot.waitUntil(lights["Source"].isEnabled, timeout=WAIT_MS)
     assert lights["Source"].toolTip() == "Light the point source"
     assert not live._note.text(), "its cause is gone"
+
+
+def test_arrow_keys_leave_region_and_line_in_the_picture(qtbot: QtBot, live: LivePanel) -> None:
+    assert live.picture.view.image is not None
+    height, width = live.picture.view.image.shape[:2]
+    box, line = live.picture.region_box, live.picture.profile_line
+    qtbot.mouseClick(live.picture.region_button, LEFT)
+    for _ in range(width // 10):
+        box.step(-1, 1, size_only=False)
+    assert box.rectangle == pytest.approx((0, height / 2, width / 2, height / 2))
+    for _ in range(width // 10):
+        box.step(1, 1, size_only=True)
+    assert box.rectangle == pytest.approx((0, height / 2, width, height / 2))
+    qtbot.mouseClick(live.picture.profile_button, LEFT)
+    for _ in range(width // 10):
+        line.step(1, -1, end_only=False)
+    assert line.ends is not None
+    (x0, y0), (x1, y1) = line.ends
+    assert (x1, y0, y1) == pytest.approx((width, 0, 0))
+    assert x0 == pytest.approx(0.2 * width)
+
+
+def test_a_region_that_the_camera_rounds_is_told(qtbot: QtBot, live: LivePanel) -> None:
+    said: list[str] = []
+    live.session.logged.connect(lambda _, words: said.append(words))
+    field = live.form.widgets["roi"]
+    _type_only(qtbot, field, "10, 20, 100, 150")
+    qtbot.keyClick(field, Qt.Key.Key_Return)
+    qtbot.waitUntil(lambda: field.text() == "12, 20, 96, 148", timeout=WAIT_MS)
+    assert "The camera reads region 12, 20, 96, 148, the nearest to 10, 20, 100, 150." in said

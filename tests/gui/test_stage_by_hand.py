@@ -125,3 +125,12 @@ def test_stop_leaves_the_target_that_is_being_typed(
     assert target.text() == "12"
     qtbot.keyClick(target, Qt.Key.Key_Return)
     qtbot.waitUntil(lambda: device.position()["z_um"] == 12_000, timeout=WAIT_MS)
+
+
+def test_a_place_without_a_reference_is_not_kept(qtbot: QtBot, window: MainWindow) -> None:
+    stage = window.show_panel("stage")
+    assert isinstance(stage, StagePanel)
+    qtbot.waitUntil(lambda: "Not homed" in stage.state.text(), timeout=WAIT_MS)
+    stage.places.save()
+    assert not window.session.kept.of("places")
+    assert "Not homed" in stage.places.save_button.toolTip()

@@ -268,6 +268,10 @@ def test_after_a_fault_the_way_on_is_a_button_where_it_happened(
     qtbot.waitUntil(lambda: not panel.run_bar.start_button.isEnabled(), timeout=WAIT_MS)
     again = panel.way_on.reconnect
     qtbot.waitUntil(again.isVisible, timeout=WAIT_MS)
+    offered = panel.way_on.run
+    with qtbot.waitSignal(panel.run.over, timeout=WAIT_MS):
+        press(qtbot, panel.way_on.go_on_button)
+    assert panel.way_on.run == offered is not None, "it is refused, and offered on"
     world.plug_in("camera")
     press(qtbot, again)
     qtbot.waitUntil(lambda: session.is_open("camera") and not again.isVisible(), timeout=WAIT_MS)
