@@ -16,6 +16,7 @@ from instrument.bench.photograph_file import PHOTOGRAPHS
 from instrument.files.atomic import DOUBTFUL
 from instrument.files.calibration_file import newest_calibration
 from instrument.files.results import find_results
+from instrument.live.light_log import light_words
 
 _DARK = 0.05
 """Below this share of full scale a picture's brightest pixels are lost in the noise of most cameras."""
@@ -136,8 +137,12 @@ def light_of(frame: Frame | None, lit: LightState = LightState.AS_IS) -> str:
 
 def _light_now(session: BenchSession) -> str:
     newest = session.live.newest()
-    is_held = newest is None and not session.live.is_running and not session.viewing.wanted
-    return "held" if is_held else light_of(newest, lit_now(session.bench))
+    if newest is None and not session.live.is_running and not session.viewing.wanted:
+        return "held"
+    then = "" if newest is None else session.lights.during(newest.metadata)
+    if then and then != light_words(session.bench) and session.live.is_running:
+        return "awaited"  # of the light before: on a large simulated sensor for seconds
+    return light_of(newest, lit_now(session.bench))
 
 
 def facts_of(session: BenchSession, made: Made) -> Facts:
@@ -220,11 +225,12 @@ def _exposed(facts: Facts, *, later: bool) -> Step:
     """Return the step to a picture that can be used; ``later``: what came after it is done."""
     words = {
         "unknown": "The first frame is awaited.",
+        "awaited": "The light was changed: a frame in the new one is awaited.",
         "held": "The live view is held: let it go on by “Live”.",
         "dark": "The picture is nearly black: light the scene, or expose longer.",
         "saturated": "The picture is saturated: expose shorter.",
     }.get(facts.light, "")
-    what = "" if facts.light in ("unknown", "held") else EXPOSE
+    what = "" if facts.light in ("unknown", "awaited", "held") else EXPOSE
     answer = EXPOSING if what else "Look at it"
     return Step("Expose", later or facts.light == "good", words, answer, "live", what)
 

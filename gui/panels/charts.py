@@ -251,7 +251,8 @@ class ChartView(QWidget):
                 value, spent = getattr(point, score.key), getattr(point, cost.key)
                 mark = "● " if name in on_front else ""
                 tip = f"{name}, on the front" if mark else name
-                for place, text in enumerate((f"{mark}{name}", f"{value:.4g}", f"{spent:.3g}")):
+                figures = (f"{figure:#.{digits}g}".rstrip(".") for figure, digits in ((value, 4), (spent, 3)))
+                for place, text in enumerate((f"{mark}{name}", *figures)):
                     self.table.setItem(number, place, cell(text, tip, number=place > 0, data=name))
         self.plot.setLabel("left", score.words)
         self.plot.setLabel("bottom", cost.words)

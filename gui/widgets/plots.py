@@ -50,7 +50,10 @@ class _Plot(pg.PlotWidget):  # type: ignore[misc] # pyqtgraph has no type annota
 
 
 class _Axis(pg.AxisItem):  # type: ignore[misc] # pyqtgraph has no type annotations
-    """An axis whose numbers all have as many digits behind the point as the finest of them needs."""
+    """An axis whose numbers all have as many digits behind the point as the finest of them needs.
+
+    Of a logarithmic one each has its own: 0.01, 1, 100.
+    """
 
     _places: int | None = None
 
@@ -59,7 +62,7 @@ class _Axis(pg.AxisItem):  # type: ignore[misc] # pyqtgraph has no type annotati
         self._places = None
         specs = super().generateDrawSpecs(painter)
         texts = [text for _, _, text in specs[2]] if specs is not None else []
-        if self._tickLevels is None and all(_DECIMAL.fullmatch(text) for text in texts):
+        if self._tickLevels is None and not self.logMode and all(_DECIMAL.fullmatch(text) for text in texts):
             places = {len(text.partition(".")[2]) for text in texts}
             if len(places) > 1:
                 self._places = max(places)

@@ -207,7 +207,11 @@ def test_a_chart_shows_the_front_and_ranks_the_settings(
         ("wiener", 0), ("admm tv", 10), ("admm tv", 40),
     ]  # fmt: skip
     rows = [[view.table.item(r, c).text() for c in range(3)] for r in range(view.table.rowCount())]
-    assert rows == [["● admm tv", "26", "0.4"], ["fista tv", "25", "0.8"], ["● wiener", "12", "0.01"]]
+    assert rows == [
+        ["● admm tv", "26.00", "0.400"],
+        ["fista tv", "25.00", "0.800"],
+        ["● wiener", "12.00", "0.0100"],
+    ]
     assert "SIMULATED" in panel.heading.text()
     assert "local tv: one PSF only" in panel.heading.toolTip()
     assert "admm l1: no time" in panel.heading.toolTip()

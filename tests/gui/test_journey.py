@@ -10,11 +10,12 @@ import pytest
 from PySide6.QtCore import Qt
 from pytestqt.qtbot import QtBot
 
-from gui.journey import EXPOSING, Facts, Made, after_all, light_of, made_in, next_of, steps_of
+from gui.journey import EXPOSING, Facts, Made, after_all, facts_of, light_of, made_in, next_of, steps_of
 from gui.main_window import MainWindow
 from gui.panels import PANELS
 from gui.panels.sweeps import SweepsPanel
 from instrument.bench.config_file import TEMPLATES, no_bench, parse_config, template
+from instrument.bench.lit import LightState, switch_light
 from instrument.runs.inspection import runs_and_photographs
 
 WAIT_MS = 60_000
@@ -89,7 +90,12 @@ def test_the_strip_names_the_next_step_and_leads_there(
     qtbot: QtBot, window: MainWindow, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     strip = window.strip
-    assert light_of(window.session.live.newest()) in ("good", "dark", "saturated")
+    session = window.session
+    assert light_of(session.live.newest()) in ("good", "dark", "saturated")
+    switch_light(session.bench, LightState.DARK)
+    qtbot.waitUntil(lambda: facts_of(session, Made()).light == "dark", timeout=WAIT_MS)
+    switch_light(session.bench, LightState.SCENE)
+    assert facts_of(session, Made()).light == "awaited", "the newest frame is of the light before"
     monkeypatch.setattr("gui.widgets.step_strip.facts_of", lambda _session, _made: given[0])
     given = [GOOD]
     strip.look()
