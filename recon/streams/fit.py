@@ -24,6 +24,8 @@ NOT_JUDGED = "The calibration is not judged yet"
 """Begins what is said of it until the first check of frames in a light has ended."""
 TOLD = 0.05
 """Share of a check from which is said how long it takes."""
+ROUNDED_S = (2, 5, 10, 20, 60)
+"""Times that are told: others would change from picture to picture."""
 AT = "it is held against turned and mirrored copies of itself"
 MORE_FRAMES = 4
 """Factor in frames averaged from which a still scene may tell what it did not tell before."""
@@ -133,11 +135,12 @@ class _Stage:
     def words(self) -> str:
         """What is looked at, and about how long it takes, once that can be told."""
         share, words = self._reached
-        at = AT if words == AMONG else f"{words.removeprefix('judging: ')}, which is looked at again"
+        at = AT if words == AMONG else f"{words.removeprefix('judging: ')} (looked at again)"
         if share < TOLD:
             return at
         left_s = (time.monotonic() - self._begun_s) * (1 - share) / share
-        return f"{at}, up to about {math.ceil(left_s)} s more"
+        rounded = next((told for told in ROUNDED_S if left_s <= told), None)
+        return f"{at}, " + ("over a minute more" if rounded is None else f"up to about {rounded} s more")
 
 
 class _Found(NamedTuple):
