@@ -1,6 +1,6 @@
 """A power cut at every moment of a run, from a log of the disk's own writes.
 
-    tests/kernel_vm/run.sh .venv/bin/python -m tests.kernel_vm.power_cut
+    KERNEL_VM_SECONDS=900 tests/kernel_vm/run.sh .venv/bin/python -m tests.kernel_vm.power_cut
 
 The kernel's dm-log-writes lies below an ext4 file system and records each write and each flush of the disk's
 cache while a run is stored. For each flush the disk is made again as it was then, mounted (its journal is
