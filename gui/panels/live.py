@@ -40,6 +40,8 @@ _LEAST_GAP_S = 0.020
 early, after one that was late, must not be held back until the next is there."""
 _STATISTICS_MS = 333
 _RATE_WINDOW_S = 2.0
+_SLOW_MS = 1000.0
+"""Exposures beyond it are told in the place of rates, which two seconds do not tell."""
 _PATIENCE_S = 1.5
 """Without a frame for longer than this and three exposures, the panel says that it waits."""
 _LIGHTS = {
@@ -315,10 +317,12 @@ class LivePanel(Panel):
     def _figures(self, frame: Frame) -> str:
         now = self.session.live.status()
         height, width = frame.image.shape[:2]
+        rates = [f"screen {self.screen_rate:.1f}/s", self._camera_words(now)]
+        if now.running and frame.metadata.exposure_ms > _SLOW_MS:
+            rates = [f"{duration(frame.metadata.exposure_ms / 1e3)} a frame"]
         words = [
             f"{width} × {height}, {frame.metadata.significant_bits} bit",
-            f"screen {self.screen_rate:.1f}/s",
-            self._camera_words(now),
+            *rates,
             f"dropped {now.dropped}",
         ]
         return "   ".join([*words, *filter(None, (self.picture.under_cross(), self.picture.region_words()))])

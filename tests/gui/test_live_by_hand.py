@@ -5,6 +5,7 @@ from __future__ import annotations
 import shutil
 import threading
 from collections import namedtuple
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -314,3 +315,12 @@ def test_a_region_that_the_camera_rounds_is_told(qtbot: QtBot, live: LivePanel) 
     qtbot.keyClick(field, Qt.Key.Key_Return)
     qtbot.waitUntil(lambda: field.text() == "12, 20, 96, 148", timeout=WAIT_MS)
     assert "The camera reads region 12, 20, 96, 148, the nearest to 10, 20, 100, 150." in said
+
+
+def test_slow_frames_have_their_time_told_and_no_rate_of_two_seconds(live: LivePanel) -> None:
+    frame = live.picture.frame
+    assert frame is not None
+    assert "camera" in live._figures(frame)
+    slow = replace(frame, metadata=replace(frame.metadata, exposure_ms=4000.0))
+    assert "4.0 s a frame" in live._figures(slow)
+    assert "/s" not in live._figures(slow)
