@@ -315,10 +315,10 @@ QLineEdit, QPlainTextEdit, QTextEdit, QListView, QTreeView, QTableView, QComboBo
   selection-background-color: {c.primary}; selection-color: {c.primary_text}; }}
 QLineEdit:focus, QPlainTextEdit:focus, QListView:focus, QTableView:focus, QComboBox:focus, QComboBox:on {{
   border: 2px solid {c.accent}; padding: 2px 4px; }}
-QLineEdit {{ placeholder-text-color: {c.dim}; }}
+QLineEdit {{ placeholder-text-color: {c.dim}; min-height: 18px; }}
 QComboBox {{ padding-left: 7px; }}
 QComboBox:focus, QComboBox:on {{ padding-left: 6px; }}
-QComboBox QLineEdit {{ border: none; background: transparent; padding: 0; }}
+QComboBox QLineEdit {{ border: none; background: transparent; padding: 0; min-height: 0; }}
 QLineEdit:read-only {{ background: {c.panel}; }}
 QLineEdit:disabled, QComboBox:disabled {{ color: {unused}; border-color: {c.line}; }}
 QLineEdit:disabled {{ placeholder-text-color: {unused}; }}

@@ -46,6 +46,9 @@ class DeviceChips(QWidget):
         failed = [one for one in self.chips if self._session.state(one).condition == "failed"]
         for one, again in self.reconnect_buttons.items():  # of several the strip has one button
             again.setVisible(failed == [one])
+        for part in (self, self.parentWidget()):
+            if part is not None and (layout := part.layout()) is not None:
+                layout.activate()  # never a word cut off for a moment
 
     def _show_all(self, kind: Kind) -> None:
         DeviceSettings(self._session, kind, self).show()

@@ -27,7 +27,7 @@ class StatusLine(QStatusBar):
         self._session = session
         self.words = label("Ready", yields=True)
         self.words.setContentsMargins(3, 0, 0, 0)
-        self.setContentsMargins(6, 0, 8, 0)
+        self.setContentsMargins(4, 1, 8, 2)
         self.progress = share_bar(0)
         self.progress.setFixedWidth(_BAR_PX)
         self.progress.hide()
