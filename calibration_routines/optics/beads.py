@@ -39,6 +39,7 @@ from recon.arrays import Float32Array
 from recon.base.declare import option
 from recon.blind import BlindResult, calibrate_from_beads
 from recon.blind.made_up import LEAST_ALIKE, MOST_BEADS
+from recon.blind.work import blind_work
 from recon.types import Calibration, Geometry
 
 Progress = Callable[[str, float], object]
@@ -206,10 +207,12 @@ class BeadProcedure(Procedure):
         geometry = binned(bench.geometry, slides.binning)
         frame = bench.camera.frame_shape[0] // slides.binning, bench.camera.frame_shape[1] // slides.binning
         frames = slides.images * (slides.average + 4)
+        needed_geometry(geometry)
+        window = window_for(slides, geometry, frame)
         light = kept_times.photographed_by(SLIDES, 1e-6 * prod(bench.camera.frame_shape[:2]))
         work = (
             (SLIDE, slides.images * light if bench.simulated_kinds else 0.0),
-            (SOLVING, kept_times.solved_by(SOLVING, 1e-6 * prod(frame))),
+            (SOLVING, blind_work((slides.images, *frame), window, slides.solver).total),
         )
         return Outlook(
             (
@@ -238,7 +241,8 @@ def _photograph_and_solve(
     facts: dict[str, Any] = {"bench": bench.label, "simulated": bool(bench.simulated_kinds)}
     listener.step(SLIDES)
     taken = photograph_slides(bench, slides, folder, control, listener, begun)
-    kept_times.solving(taken.images[0].size / 1e6)
+    shape = taken.images.shape[0], taken.images.shape[1], taken.images.shape[2]
+    kept_times.counted(blind_work(shape, window_for(slides, geometry, shape[1:]), slides.solver).total)
     listener.step(SOLVING)
 
     def solving(_words: str, done: float) -> None:

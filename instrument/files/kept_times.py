@@ -38,8 +38,6 @@ _TRANSFORMS_PER_MEGAPIXEL = {
 1024 x 1024 which is transformed and back; where light has to be computed first, and where it is there."""
 _ANALYSED = {"analysing": 45.0}
 """The same of steps that look at pictures of any bench, simulated or not."""
-_PER_SOLVED_MEGAPIXEL = {"blind deconvolution": 150_000.0}
-"""What comes on top for each megapixel of the pictures that are solved, after binning: :func:`solving`."""
 _TRANSFORMS = {
     "drawing": 140.0,
     "optics": 3300.0,
@@ -53,7 +51,6 @@ _TRANSFORMS = {
     "aligning the mask": 14600.0,
     "aligning the demo's mask": 4800.0,
     "render the animal's light": 6500.0,
-    "blind deconvolution": 1500.0,
     "learning": 28000.0,
     "expose without saturating": 120.0,
     "dark frames and axial sweep": 510.0,
@@ -70,6 +67,8 @@ _TRANSFORMS = {
 }
 """Transforms that steps take the first time, of any sensor; each of those that they count. Drawing is a page
 with its library and the list of fonts; the others are by default options, and those of the demos."""
+_COUNTED = {"blind deconvolution"}
+"""Steps whose work goes with much that only their routine knows: :func:`counted`."""
 _ALONE_IN_IT = "drawing"
 """Keeps to one thread."""
 _FEW, _TRIED_S = 50.0, 0.05
@@ -78,7 +77,7 @@ _ALONE = 1.2
 """Times as long as if all of it were shared among the threads."""
 _of = ""
 _megapixels = 0.0
-_solved_megapixels = 0.0
+_counted = 0.0
 _is_simulated = False
 _awaits_light: Callable[[], bool] = bool
 _window = False
@@ -106,15 +105,10 @@ def about(
     _of, _megapixels, _is_simulated, _awaits_light = what, megapixels, simulated, awaits_light
 
 
-def solving(megapixels: float) -> None:
-    """Say how large the pictures are, each of them, that the following step solves."""
-    global _solved_megapixels
-    _solved_megapixels = megapixels
-
-
-def solved_by(step: str, megapixels: float) -> float:
-    """Return what a step that solves pictures of so many megapixels computes, in transforms."""
-    return _TRANSFORMS.get(step, 0.0) + _PER_SOLVED_MEGAPIXEL.get(step, 0.0) * megapixels
+def counted(transforms: float) -> None:
+    """Say what the following step computes, in transforms, where its routine has counted that."""
+    global _counted
+    _counted = transforms
 
 
 def photographed_by(step: str, megapixels: float) -> float:
@@ -148,7 +142,7 @@ def expected(what: str, count: float = 1.0) -> Expected | None:
     except (LookupError, TypeError, ValueError):
         step = what.casefold()
         transforms = _TRANSFORMS.get(step, 0.0) * count + _ANALYSED.get(step, 0.0) * _megapixels
-        transforms += _PER_SOLVED_MEGAPIXEL.get(step, 0.0) * _solved_megapixels
+        transforms += _counted if step in _COUNTED else 0.0
         if _is_simulated:
             awaited, here = _TRANSFORMS_PER_MEGAPIXEL.get(step, (0.0, 0.0))
             transforms += (awaited if _computes_light() else here) * _megapixels

@@ -6,7 +6,7 @@ PSFs bend to make up for it. Then the same again with beads as points (:mod:`rec
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -16,6 +16,8 @@ from recon.base.threads import linear_algebra_on_one_thread
 from recon.blind.made_up import alike_by_halves
 from recon.blind.polish import first_psf, offset_of, polish
 from recon.blind.psf_step import BeadMixer, refuse_what_is_no_beads, solve_psfs
+from recon.blind.settings import BlindSettings
+from recon.blind.work import blind_work, grid_points
 from recon.camera.convolution import field_of
 from recon.camera.points import Points, points_on_grid
 from recon.camera.registration import shifted
@@ -25,45 +27,6 @@ from recon.priors import L1, NonNegativity
 from recon.solvers import Fista, StoppingRules
 
 Progress = Callable[[str, float], object]
-
-_GRID_SHARE = 0.49
-"""Of the time, on the grid. Nine slides binned 4 x 4: 0.45, 0.51, five 8 x 8: 0.51."""
-_POINTS_SHARE = 0.47
-"""Of the time, with points; the rest for the halves of the images and of noise, 0.02 each."""
-_BEADS_SHARE = 0.45
-"""Of a rank's time, for beads; the rest for PSFs. Nine slides binned 4 x 4, by rank: 0.52, 0.37, 0.44."""
-
-
-@dataclass(frozen=True, slots=True)
-class BlindSettings:
-    """How the bead images are solved.
-
-    Attributes
-    ----------
-    grid : (int, int)
-        Rows and columns of PSFs over the field.
-    ranks : sequence of int
-        The rank of each round on the grid, rising (Kuo 2020: raised after each alternating solve).
-    iterations : int
-        Of each half-step (Kuo 2020: 100).
-    degree : int
-        Highest degree of the polynomials over the field with which PSFs vary in the end: 0, 1 or 2, and so
-        rank 1, 3 or 6. It is lowered where the beads are too few.
-    tau : float
-        Weight of the beads' sparsity relative to ``max |A^H b|`` (Eq. 5.12).
-    reach : float
-        Part of the sensor that the outermost PSFs stand for: 0.8 puts them at 80 % of the way to its edge.
-    improvement : float
-        Relative decrease of the misfit below which a further round is not worth it.
-    """
-
-    grid: tuple[int, int] = (5, 5)
-    ranks: Sequence[int] = (1, 2, 3)
-    iterations: int = 60
-    degree: int = 2
-    tau: float = 0.01
-    reach: float = 0.8
-    improvement: float = 0.02
 
 
 @dataclass(frozen=True)
@@ -154,7 +117,8 @@ def calibrate_from_beads(
     scale = np.float32(data.max())
     data = np.asarray(data / scale, np.float32)
     sensor = (data.shape[1], data.shape[2])
-    points = _points(sensor, settings)
+    points = grid_points(sensor, settings)
+    work = blind_work((len(data), *sensor), psf_shape, settings)
     field_shape, centre = field_of(sensor, psf_shape)
     rows, columns = (np.arange(n) - c for n, c in zip(field_shape, centre, strict=True))
     weights = interpolation_weights(points, np.eye(len(points)), rows, columns).astype(np.float32)
@@ -168,10 +132,9 @@ def calibrate_from_beads(
     stopped = "the last rank was reached"
     ranks = [r for r in settings.ranks if r <= len(points)]
     for number, rank in enumerate(ranks):
-        share, part = _GRID_SHARE * number / len(ranks), _GRID_SHARE / len(ranks)
 
-        def finding(done: float, rank: int = rank, share: float = share, part: float = part) -> None:
-            report(f"rank {rank}: beads", share + _BEADS_SHARE * part * done)
+        def finding(done: float, rank: int = rank, before: float = work.on_grid(number)) -> None:
+            report(f"rank {rank}: beads", (before + work.beads * done) / work.total)
 
         beads = _solve_beads(data, np.maximum(psfs, 0), points, beads, settings, finding)
         if not beads.any():
@@ -179,7 +142,7 @@ def calibrate_from_beads(
                 "No bead was found: the first PSF explains nothing. Are the images of the same optics, with "
                 "several beads each and their background removed?"
             )
-        report(f"rank {rank}: PSFs", share + _BEADS_SHARE * part)
+        report(f"rank {rank}: PSFs", (work.on_grid(number) + work.beads) / work.total)
         mixer = BeadMixer(weights, beads, psf_shape, sensor)
         psfs, half = solve_psfs(mixer, data, psfs, rank, settings.iterations)
         psfs, beads = _by_convention(psfs, beads)
@@ -196,10 +159,10 @@ def calibrate_from_beads(
         psf_shape,
         settings.iterations,
         settings.degree,
-        lambda share: report("beads between pixels", _GRID_SHARE + _POINTS_SHARE * share),
+        lambda share: report("beads between pixels", work.between_pixels(share) / work.total),
     )
     refuse_what_is_no_beads(data, polished.images(sensor), polished.beads)
-    report("both halves of the images", _GRID_SHARE + _POINTS_SHARE)
+    report("both halves of the images", work.between_pixels(1.0) / work.total)
     alike = alike_by_halves(data, polished, settings.iterations)
     psfs = polished.at(points)
     light = psfs.sum(axis=(1, 2), keepdims=True)
@@ -242,14 +205,6 @@ def _check(data: Float32Array, psf_shape: tuple[int, int], settings: BlindSettin
         raise InputError("The grid and the iterations are at least 1, tau lies between 0 and 1.")
     if settings.degree not in (0, 1, 2):
         raise InputError(f"PSFs vary over the field with degree 0, 1 or 2, not {settings.degree}.")
-
-
-def _points(sensor: tuple[int, int], settings: BlindSettings) -> Float64Array:
-    axes = [
-        np.linspace(-0.5, 0.5, k) * settings.reach * n if k > 1 else np.zeros(1)
-        for k, n in zip(settings.grid, sensor, strict=True)
-    ]
-    return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 2).round()
 
 
 def _solve_beads(

@@ -41,6 +41,7 @@ class Mixer(LinearOperator):
         self._grid = fft.fast_shape(field_of(sensor_shape, psf_shape)[0])
         self._spectra = np.empty((*counts, *fft.spectrum_shape(self._grid)), np.complex64)
         self._seen = np.empty((n_images, *self._spectra.shape[2:]), np.complex64)
+        self._product = np.empty(self._spectra.shape[1:], np.complex64)
         self._rows = np.empty((n_images, sensor_shape[0], self._grid[1]), np.float32)
 
     def forward(self, x: Numbers, out: Float32Array | None = None) -> Float32Array:
@@ -63,7 +64,7 @@ class Mixer(LinearOperator):
         np.conj(self._seen, out=self._seen)
         total = np.zeros(self._spectra.shape[1:], np.complex64)
         for row, image in zip(self._spectra, self._seen, strict=True):
-            total += row * image
+            total += np.multiply(row, image, out=self._product)
         back = fft.irfft(np.conj(total), self._grid[1])
         return _into(out, back[:, :height, :width])
 

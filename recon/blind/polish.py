@@ -9,6 +9,7 @@ import numpy as np
 
 from recon.arrays import Array, Float32Array, Float64Array
 from recon.blind.points import PointMixer, solve_smooth, support_of
+from recon.blind.work import ROUNDS_A_DEGREE
 from recon.camera.points import FieldFunctions, PointImages, Points, cleaned, overlooked, refine
 from recon.camera.registration import displacement, shifted
 
@@ -82,7 +83,6 @@ def _brightest_window(image: Array, shape: tuple[int, int]) -> tuple[slice, slic
 
 
 _BEADS_A_FUNCTION = 4  # at least so many beads for each field function
-_ROUNDS = 3  # with each degree
 _LEAST_GAIN = 0.003  # relative decrease of the misfit that another round must bring
 
 
@@ -155,8 +155,8 @@ def polish(
         if degree > highest_degree_for(len(places)):
             break
         best = np.inf
-        for number in range(_ROUNDS):
-            on_progress((degree + number / _ROUNDS) / len(degrees))
+        for number in range(ROUNDS_A_DEGREE):
+            on_progress((degree + number / ROUNDS_A_DEGREE) / len(degrees))
             functions = FieldFunctions(degree, np.concatenate([points.places for points in beads]))
             mixer = PointMixer(beads, functions, psf_shape, sensor)
             start = np.zeros((functions.count, *psf_shape), np.float32)
