@@ -294,12 +294,13 @@ class BenchSession(QObject):
             return
         self.log("error", f"{job.title}: {words_for(error)}")
         if isinstance(error, DeviceError) and not isinstance(error, LimitError | StoppedError):
-            self.note_failure(error)
+            self.note_failure(error, was_used=bool(job.lanes))
 
-    def note_failure(self, error: DeviceError, *, surely: bool = False) -> None:
+    def note_failure(self, error: DeviceError, *, was_used: bool, surely: bool = False) -> None:
         """Mark the device that an error names as failed, unless it only refused what it was asked.
 
-        One that does not answer stops everything else: light off, motion halted.
+        One that does not answer who used it stops everything else: light off, motion halted. A display that
+        looked at it, beside a run perhaps, does not: an answer may be late once, and its user will meet it.
         """
         for kind, device in self.bench.devices.items():
             if (
@@ -308,8 +309,9 @@ class BenchSession(QObject):
                 and (surely or is_gone(device, error))
             ):
                 self._set_state(kind, DeviceState("failed", words_for(error), self.state(kind).simulated))
-                if isinstance(error, DeviceTimeoutError) and not (self._stopping or self.is_closing):
-                    self.stop(f"the {name_of(kind)} does not answer")  # nor is it known what it does
+                is_free = not (self._stopping or self.is_closing)
+                if was_used and is_free and isinstance(error, DeviceTimeoutError):
+                    self.stop(why=f"the {name_of(kind)} does not answer")  # nor is it known what it does
 
     def _look_after_devices(self) -> None:
         """Notice a stream that ended or hangs, and devices that were lost while nobody used them."""
@@ -317,7 +319,7 @@ class BenchSession(QObject):
         error = self.live.error or (self._hung if hung else None)
         if error is not None and self.is_open("camera"):
             self.log("error", f"Live view: {words_for(error)}")
-            self.note_failure(error, surely=True)
+            self.note_failure(error, was_used=True, surely=True)
         for kind, device in self.bench.devices.items():
             if self.is_open(kind) and not device.is_open and not self.jobs.is_busy(kind):
                 text = f"{device.name} was lost. Check its cable and power, then reconnect it."
@@ -325,7 +327,7 @@ class BenchSession(QObject):
                 self._set_state(kind, DeviceState("failed", text, self.state(kind).simulated))
 
     # STOP ----------------------------------------------------------------------------------------
-    def stop(self, why: str = "") -> None:
+    def stop(self, *, why: str = "") -> None:
         """STOP: motion halted, light off, the running device jobs cancelled. Returns at once.
 
         ``why`` where nobody pressed it.

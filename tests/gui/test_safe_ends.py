@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from pytestqt.qtbot import QtBot
 
+from drivers.errors import DeviceTimeoutError
 from drivers.simulated.camera import SimulatedCamera
 from drivers.simulated.slm import SimulatedSlm
 from gui.jobs import JobContext, JobState
@@ -153,6 +154,25 @@ def test_a_device_that_does_not_answer_stops_everything(
     assert "STOP: the SLM does not answer." in lines
     assert session.state("slm").condition == "failed"
     answers.set()
+
+
+def test_a_look_that_is_answered_late_ends_nothing(qtbot: QtBot, session: BenchSession) -> None:
+    goes_on = threading.Event()
+    run = session.jobs.exclusive("A run of hours", lambda _: goes_on.wait(WAIT_MS / 1000))
+    stage = session.bench.stage
+    assert stage is not None
+
+    def late(_: JobContext) -> None:
+        raise DeviceTimeoutError(stage.name, "did not answer within 1 s.", "Look at its cable.")
+
+    looks = [session.jobs.watch("Reading the stage", late)]
+    qtbot.waitUntil(lambda: looks[0].is_over, timeout=WAIT_MS)
+    assert session.state("stage").condition == "failed"
+    assert run.state is JobState.RUNNING
+    assert not run.is_cancelling
+    goes_on.set()
+    qtbot.waitUntil(lambda: run.is_over, timeout=WAIT_MS)
+    assert run.state is JobState.SUCCEEDED
 
 
 def test_a_camera_that_hangs_in_the_live_view_is_named_and_the_light_put_out(
