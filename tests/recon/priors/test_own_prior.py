@@ -123,7 +123,7 @@ def test_a_second_total_variation_is_taken_by_its_prox(solver):
     operator, data = problem(1)
     half = TotalVariation(0.2, tolerance=1e-12)
     found = solver(operator, data, half + half + NonNegativity()).run(
-        StoppingRules(iterations=600, tolerance=1e-8)
+        StoppingRules(iterations=250, tolerance=1e-8)
     )
     whole = solver(operator, data, TotalVariation(0.4) + NonNegativity()).run(RULES)
     of = TotalVariation(0.4) + NonNegativity()
