@@ -146,9 +146,9 @@ def test_bead_images_give_psfs_over_the_field(camera: Microscope, images: np.nda
     assert found.psfs.sum(axis=(1, 2)) == pytest.approx(np.ones(9), rel=1e-4)
     for psf, (row, column) in zip(found.on_sensor(), found.points, strict=True):
         assert alike(psf, camera.psf(row, column)) > 0.8
-    # The same again is the same again, and a few iterations tell.
+    # The same again is the same again, and a few iterations of a few images tell.
     few = replace(settings, iterations=3)
-    first, again = (calibrate_from_beads(images, WINDOW, few).psfs for _ in range(2))
+    first, again = (calibrate_from_beads(images[:3], WINDOW, few).psfs for _ in range(2))
     np.testing.assert_array_equal(first, again)
 
 
