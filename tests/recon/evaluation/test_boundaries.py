@@ -140,7 +140,7 @@ def test_smooth_diffusers_and_regular_lenslets_fail_earlier_as_photons_fall(draw
                 )[0]
                 for e in light
             ]
-            for k in range(5)
+            for k in range(3)
         ]
         rows[optics] = np.median(severities, axis=0)
 
