@@ -35,7 +35,8 @@ from instrument.runs.writer import RunWriter
 from recon.errors import InputError
 from tests.calibration_routines.display.test_mask_alignment import BENT, small
 
-TEXT = small(shape="[120, 160]").replace("settle_ms = 30.0", BENT)
+BENCH = small(shape="[120, 160]")
+TEXT = BENCH.replace("settle_ms = 30.0", BENT)
 ENDS_AT = 2
 """Before the levels, which one sequence of the hardware takes."""
 
@@ -135,7 +136,7 @@ def test_an_alignment_that_was_interrupted_says_where_the_stage_is_and_goes_on(t
     near = AlignmentSettings(reach=8.0, depth_um=100.0, spots=25, section_pictures=1, refinements=1)
     settings = replace(near, max_frames=10, out=tmp_path / "a.json")
     control = RunControl()
-    with Bench(parse_config(small(), None)).open() as bench, pytest.raises(EndedEarlyError) as ended:
+    with Bench(parse_config(BENCH, None)).open() as bench, pytest.raises(EndedEarlyError) as ended:
         AlignmentProcedure(settings).carry_out(bench, tmp_path, control=control, listener=Ends(control))
     (path,) = (p for p in tmp_path.iterdir() if p.is_dir())
     notes = " ".join(ended.value.__notes__)
@@ -147,7 +148,7 @@ def test_an_alignment_that_was_interrupted_says_where_the_stage_is_and_goes_on(t
     began = Run.open(path).metadata(kept - 1).host_time_ns
     going_on = AlignmentProcedure(replace(settings, again=path))
     with (
-        Bench(parse_config(small(), None)).open() as bench,
+        Bench(parse_config(BENCH, None)).open() as bench,
         pytest.raises(AlignmentFailedError, match="gave up after 10 frames"),
     ):
         going_on.carry_out(bench, tmp_path)
@@ -165,7 +166,7 @@ def test_frames_that_are_all_there_are_a_complete_run_whatever_becomes_of_the_le
         display_learning, "photograph_series", lambda seen, _: Mock(looks=[seen.io.photograph(10.0)])
     )
     learning = LearningProcedure(out=tmp_path / "d.json")
-    with Bench(parse_config(small(), None)).open() as bench, pytest.raises(InputError) as ended:
+    with Bench(parse_config(BENCH, None)).open() as bench, pytest.raises(InputError) as ended:
         learning.carry_out(bench, tmp_path)
     (path,) = (p for p in tmp_path.iterdir() if p.is_dir())
     run = Run.open(path)

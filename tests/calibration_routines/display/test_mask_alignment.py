@@ -69,7 +69,7 @@ def aligned(bench: Bench, settings: AlignmentSettings = SETTINGS):
 
 @pytest.mark.slow
 def test_it_says_so_when_it_fails_and_puts_the_stage_back() -> None:
-    text = small(shift_um="[400.0, -42.0]")  # far outside what is searched
+    text = small(shift_um="[400.0, -42.0]", shape="[120, 168]")  # far outside what is searched
     with Bench(parse_config(text, None)).open() as bench:
         assert bench.stage is not None
         with pytest.raises(AlignmentFailedError, match="failed: spots reach"):
