@@ -308,6 +308,8 @@ def in_other_words(
 
     A whole command ("diffuserbench snap --dark") stays as it is typed; ``otherwise`` names a flag of none.
     """
+    if not _FLAG.search(text):
+        return text  # most helps have none, and a form asks for each of its fields
     names: dict[str, str] = {}
     for option in options:
         on_off = [flag.split("/") for flag in option.flags if flag.startswith("--")]
