@@ -7,6 +7,7 @@ change is about that change. Everywhere else they look for new ones.
 from __future__ import annotations
 
 import fcntl
+import gc
 import os
 import signal
 import threading
@@ -85,6 +86,12 @@ def _begin_random_numbers(module: object, name: str) -> None:
         if isinstance(shared, np.random.Generator):
             seed = zlib.crc32(f"{name} {number}".encode())
             shared.bit_generator.state = type(shared.bit_generator)(seed).state
+
+
+def pytest_collection_finish() -> None:
+    """Keep Python from looking for garbage among all tests and all that is imported, again and again."""
+    gc.collect()
+    gc.freeze()
 
 
 @pytest.hookimpl(tryfirst=True)
