@@ -251,7 +251,8 @@ class VolumeAdmm(ExactAdmm):
         weights = np.asarray((0.0, 0.0, 0.0) if tv is None else tv.axis_weights, dtype)
         if weights.shape[-1] == 2:
             weights = np.concatenate([np.zeros_like(weights[..., :1]), weights], axis=-1)
-        self.axis_weights = np.ascontiguousarray(np.broadcast_to(weights, (nz, 3)))
+        # Never the read-only view: for that, numba would compile every kernel a second time.
+        self.axis_weights = np.broadcast_to(weights, (nz, 3)).copy()
         self.kappa = dtype.type(self.tuning.kappa)
         start = (
             None if initial is None else np.ascontiguousarray(initial, dtype).reshape(operator.domain_shape)

@@ -2,6 +2,7 @@
 
 import threading
 
+import numba
 import numpy as np
 import pytest
 
@@ -256,6 +257,14 @@ def test_total_variation_begins_at_its_start():
     start = np.random.default_rng(5).standard_normal(operator.domain_shape)
     solver = LeanTotalVariation(operator, data, tv(1.0), initial=start)
     np.testing.assert_array_equal(solver.solution, np.maximum(start, 0))
+
+
+def test_kernels_are_compiled_once_for_weights_of_all_planes_and_of_each():
+    operator, data = problem()
+    solvers = [
+        LeanTotalVariation(operator, data, tv(0.1, axis_weights=w)) for w in (np.ones(3), np.ones((5, 3)))
+    ]
+    assert numba.typeof(solvers[0].axis_weights) == numba.typeof(solvers[1].axis_weights)
 
 
 def test_residual_is_that_of_the_solution():
