@@ -178,7 +178,13 @@ class MicroManagerCamera(MicroManagerDevice, BufferedCamera):
         known = self.own_settings().get(name)
         if known is None:
             return super().set_own(name, value)
-        made = self._camera.set(name, value)
+        whole = (self._roi.height, self._roi.width) == self._sensor
+        try:
+            made = self._camera.set(name, value)
+        finally:  # refused as well, the pixels may be others along with it
+            self._read_shape()
+            if whole:
+                self._sensor = self._roi.height, self._roi.width
         self._remember_own(name, value, known.choices)
         return made
 
@@ -458,7 +464,8 @@ class MicroManagerCamera(MicroManagerDevice, BufferedCamera):
         if self._components == 4:  # blue, green, red, nothing
             np.copyto(out, data.reshape(*out.shape[:2], 4)[..., 2::-1])
         else:
-            np.copyto(out, data.view(out.dtype).reshape(out.shape))
+            sent = data.view(np.uint8 if self._bytes == 1 else np.uint16).reshape(out.shape)
+            np.copyto(out, sent, casting="unsafe")  # 8 bits that are sent in two bytes are 8 bits
         return True
 
     def _fire(self) -> None:

@@ -416,6 +416,18 @@ def test_one_wheel_cannot_stand_at_two_places(manager: MicroManager) -> None:
         assert light.pattern.description == "red"
 
 
+def test_frames_are_those_of_pixels_that_an_own_setting_changed(adapters: Path) -> None:
+    with camera_on(manager_of(adapters, "Cam")) as camera:
+        assert camera.pixel_format == "Mono8"
+        camera.set_own("BitDepth", "16")
+        assert (camera.pixel_format, camera.significant_bits) == ("Mono16", 16)
+        assert camera.snap().image.dtype == np.uint16
+        camera.set_own("BitDepth", "8")  # still in two bytes
+        assert camera.snap().image.max() < 256
+        camera.set_own("OnCameraCCDXSize", "256")
+        assert camera.sensor_shape == camera.snap().image.shape == (512, 256)
+
+
 def test_own_settings_are_the_properties_that_the_driver_leaves_alone(adapters: Path) -> None:
     with camera_on(manager_of(adapters, "Cam")) as camera:
         own = camera.own_settings()
