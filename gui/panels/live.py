@@ -433,9 +433,10 @@ class LivePanel(Panel):
         self._show_light()
 
     def _show_light(self) -> None:
-        now = self.light
+        now, known = self.light, self.session.bench.knows_scene
         for switch in self.light_buttons.buttons():
-            switch.setChecked(switch.property("light") == now.value)
+            # Dark is not what an operator's own lamp may be.
+            switch.setChecked(switch.property("light") == now.value and (known or now is not LightState.DARK))
 
     def _device_changed(self, kind: str) -> None:
         if kind != "camera":

@@ -440,6 +440,17 @@ def test_a_recording_ends_under_the_light_that_it_began_with(
     assert bench.scene_lit is scene
 
 
+def test_dark_is_not_said_where_the_operators_own_lamp_may_shine(
+    live: LivePanel, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    live.session.bench.scene_off()
+    live._show_light()
+    assert [b.text() for b in live.light_buttons.buttons() if b.isChecked()] == ["Dark"]
+    monkeypatch.setattr(type(live.session.bench), "knows_scene", property(lambda _: False))
+    live._show_light()
+    assert not any(button.isChecked() for button in live.light_buttons.buttons())
+
+
 def test_leds_that_are_not_the_source_are_not_called_so(qtbot: QtBot, live: LivePanel) -> None:
     bench = live.session.bench
     assert bench.led_array is not None
