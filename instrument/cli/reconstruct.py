@@ -15,7 +15,7 @@ from instrument.files.errors import BenchError
 from instrument.reconstruction.options import InputOptions, OutputOptions, SourceOptions, VideoOptions
 from instrument.reconstruction.request import VolumeRequest, request_of
 from instrument.reconstruction.result_file import Outputs
-from instrument.tasks.task import Given
+from instrument.tasks.task import Given, guarded
 from recon.reconstruction.options import ReconstructionOptions
 
 app = App()
@@ -100,10 +100,10 @@ def _photograph(asked: _Asked) -> None:
             f"{' and '.join(flags)}: for a PSF image (--psf); a calibration's PSFs were judged when they "
             f"were measured. Leave {'it' if len(flags) == 1 else 'them'} out."
         )
-    outputs = Outputs.named(
-        output.out or _PICTURE, output.figure, volume=is_volume, uncertainty=asked.options.uncertainty
-    )
-    finish(reconstruct_photograph(Terminal(), request, outputs, output))
+    out = output.out or _PICTURE
+    outputs = Outputs.named(out, output.figure, volume=is_volume, uncertainty=asked.options.uncertainty)
+    with guarded({"source": source, "inputs": asked.inputs, "out": out}):  # its own name was not asked before
+        finish(reconstruct_photograph(Terminal(), request, outputs, output))
 
 
 def _video(asked: _Asked, run: Path | None) -> None:

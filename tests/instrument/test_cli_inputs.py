@@ -11,14 +11,16 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
+import numpy as np
 import pytest
 import typer
 
 from instrument.bench.config_file import load_config, template
-from instrument.cli import COMMANDS
+from instrument.cli import COMMANDS, main
 from instrument.cli.options import _WORDS, flat
 from instrument.files.atomic import refuse_input, whole_file, write_bytes
 from instrument.files.errors import FileError
+from instrument.files.images import write_image
 from instrument.plan import Part, Plan
 from instrument.plan.model import load_plan
 from instrument.reconstruction.checkpointing import CheckpointFolder
@@ -234,6 +236,20 @@ def test_no_result_becomes_one_more_image_of_a_folder_that_is_read(tmp_path: Pat
     ):
         with guarded(values):
             pass
+
+
+def test_nor_does_one_by_the_name_that_a_command_gives_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    stack = tmp_path / "stack"
+    stack.mkdir()
+    for depth_mm in (100, 200):
+        write_image(stack / f"z{depth_mm}mm.tif", np.eye(16, dtype=np.uint16))
+    write_image(tmp_path / "photo.tif", np.eye(16, dtype=np.uint16))
+    monkeypatch.chdir(stack)
+    assert main(["reconstruct", "--volume", ".", "--image", "../photo.tif"]) == 2
+    assert "one more image of" in capsys.readouterr().err
+    assert len(list(stack.iterdir())) == 2
 
 
 def test_a_checkpoint_that_an_input_was_put_into_is_not_removed_with_it(tmp_path: Path) -> None:

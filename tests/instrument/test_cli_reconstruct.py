@@ -426,7 +426,7 @@ def test_the_help_fits_on_two_screens_with_what_is_rare_at_the_end(
 def test_what_is_about_psf_images_is_refused_with_a_calibration(
     words: tuple[str, ...], here: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    arguments = ["--calibration", str(here), "--image", "raw.tif", "--out", "out.tif"]
+    arguments = ["--calibration", str(here), "--image", "raw.tif", "--out", "../out.tif"]
     assert main(["reconstruct", *arguments, *words]) == 2
     assert f"{words[0]}: for a PSF image" in capsys.readouterr().err
 
