@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from dataclasses import dataclass, field
 from types import SimpleNamespace
 from typing import Any
@@ -202,3 +203,11 @@ def test_iterations_end_with_the_budget_a_newer_frame_or_nothing_more_to_gain(
     found = reconstructor._iterate(level, Spent(100.0, 0.0), at_most, newer)
     assert found == (done, Spent(10.0 * done, 0.0))
     assert reconstructor._settled is (confirmed and done == settles_after)
+
+
+def test_the_clock_is_told_in_milliseconds_with_the_processor_time_of_this_thread() -> None:
+    before = time.perf_counter(), time.thread_time()
+    now = live_module._now()
+    after = time.perf_counter(), time.thread_time()
+    assert 1e3 * before[0] <= now.wall_ms <= 1e3 * after[0]
+    assert 1e3 * before[1] <= now.work_ms <= 1e3 * after[1]
