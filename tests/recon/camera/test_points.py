@@ -94,6 +94,8 @@ def test_points_that_are_one_are_merged_into_the_brighter_and_dim_ones_go() -> N
     assert [light for *_, light in listed(cleaned(camera(), some, 0.1))] == pytest.approx(
         [2 * sure, 1.01 * sure]
     )
+    bright = points(*((0, 5 * k, light) for k, light in enumerate((4, 4, 4, 4, 0.7, 0.5))))
+    assert cleaned(camera(), bright, 0.0).light.tolist() == [4, 4, 4, 4, 0.7], "0.15 of the median light"
     assert len(cleaned(camera(), points(), 0.1)) == 0
     assert cleaned(camera(), points((0, 0, 0.1)), 1e3).places.shape == (0, 2)
 
