@@ -161,11 +161,11 @@ def test_an_array_grows_with_the_first_frame_beyond_it(tmp_path: Path) -> None:
     with RunWriter.create(tmp_path, label="r", bench=BENCH) as writer:
         writer.write([frame(0)])
         assert Run.open(writer.path).array.n_frames == 256
-        writer.write([frame(256)])
+        writer.write([frame(255), frame(256)])
         assert Run.open(writer.path).array.n_frames == 512
         writer.write([frame(1600)])
         assert Run.open(writer.path).array.n_frames == 1601
-        assert sorted(writer.finish(FinishReason.COMPLETED).records) == [0, 256, 1600]
+        assert sorted(writer.finish(FinishReason.COMPLETED).records) == [0, 255, 256, 1600]
 
 
 @pytest.mark.parametrize(

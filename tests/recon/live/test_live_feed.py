@@ -211,3 +211,46 @@ def test_the_clock_is_told_in_milliseconds_with_the_processor_time_of_this_threa
     after = time.perf_counter(), time.thread_time()
     assert 1e3 * before[0] <= now.wall_ms <= 1e3 * after[0]
     assert 1e3 * before[1] <= now.work_ms <= 1e3 * after[1]
+
+
+@dataclass(frozen=True)
+class Noticing:
+    """A level, and whether it sees light."""
+
+    sees: bool
+    lit: bool
+    detail: str = "these pixels"
+    binning: int = 1
+    whole: Any = None
+
+    def sees_light(self, mean: Any, count: int) -> bool:
+        np.testing.assert_array_equal(mean, MEAN[0])
+        assert count == 7
+        return self.sees
+
+
+@pytest.mark.parametrize(
+    ("level", "coming", "made"),
+    [
+        (Noticing(sees=False, lit=False), None, []),
+        (Noticing(sees=True, lit=True), None, []),
+        (Noticing(sees=True, lit=False), "another", []),
+        (Noticing(sees=True, lit=False), None, ["these pixels"]),
+    ],
+)
+def test_what_was_made_in_the_dark_is_made_anew_once_there_is_light(
+    level: Noticing, coming: Any, made: list[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    reconstructor, told, seen = live(), list[str](), list[Any]()
+    reconstructor._shape = SHAPE
+    monkeypatch.setattr(reconstructor, "_make", lambda detail, _: told.append(detail))
+    reconstructor._watch = SimpleNamespace(mean=MEAN, count=7)  # type: ignore[assignment]
+    reconstructor._fit = SimpleNamespace(advice="look", see=lambda _, *of: seen.append(of))  # type: ignore[assignment]
+    reconstructor._level, reconstructor._coming, before = level, coming, reconstructor.warnings  # type: ignore[assignment]
+    for _ in range(2):
+        given: Any = reconstructor._level
+        assert reconstructor._sees_light(given, MEAN) is level.sees
+    assert told == made
+    assert reconstructor._level == (Noticing(sees=True, lit=True) if made else level)
+    assert seen == [(1, reconstructor._scene, 7)] * 2 * level.sees
+    assert reconstructor.warnings == (*before, *["look"] * level.sees)

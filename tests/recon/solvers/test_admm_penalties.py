@@ -50,6 +50,21 @@ def test_what_stands_at_erased_pixels_is_no_data() -> None:
         assert one.advance().objective == other.advance().objective
 
 
+def test_a_channel_without_light_keeps_its_penalty() -> None:
+    camera = Convolution(RNG.random((1, 4, 5)) ** 3, (7, 8), n_channels=2, dtype=np.float64)
+    data = np.concatenate([np.zeros((1, 7, 8)), DATA])
+    solver = Admm(camera, data, TV)
+    before = np.array(solver.penalties)
+    for _ in range(4):
+        assert np.isfinite(solver.advance().objective)
+    np.testing.assert_array_equal(solver.penalties, before)
+    seen = np.abs(solver.solution[1, ::2, ::2])
+    solver.advance()
+    after = before.copy()
+    after[1, 1] = 0.03 / (np.percentile(seen, 99.9) / 10)  # the threshold is a tenth of the brightness
+    np.testing.assert_allclose(solver.penalties, after)
+
+
 def test_without_a_weight_no_penalty_is_taken_away() -> None:
     solver = Admm(CAMERA, DATA, TotalVariation(0.0) + NonNegativity())
     out = solver.run(StoppingRules(iterations=40, tolerance=0))
@@ -86,6 +101,12 @@ def test_the_datas_split_begins_with_what_the_object_casts_and_counts_its_change
 
     for _ in range(2):
         before = prox()
-        split.solve(0, RNG.random(camera.grid_shape), 0.3, 0.2)
+        split.solve(0, y := RNG.random(camera.grid_shape), 0.3, 0.2)
+        cast = np.fft.irfft2(np.fft.rfft2(y) * camera.channel_spectrum(0)[0], camera.grid_shape)
+        taken = np.fft.irfft2(split.Q[0], camera.grid_shape)
+        left = cast[camera.sensor_window] - split._data[0]
+        assert split.sums[0, 0] == pytest.approx(np.sum(left**2))
+        assert split.sums[0, 1] == pytest.approx(np.sum((cast - prox()) ** 2))
+        assert split.sums[0, 4] == pytest.approx(np.sum(taken**2))
         assert split.sums[0, 2] == pytest.approx(np.sum((prox() - before) ** 2))
         assert split.sums[0, 3] == pytest.approx(np.sum(prox() ** 2))

@@ -341,6 +341,13 @@ def test_what_a_start_casts_on_a_device_is_what_it_casts_on_the_host() -> None:
         np.testing.assert_allclose(device.solution, host.solution, atol=1e-9)
 
 
+def test_of_nothing_a_volume_stays_nothing() -> None:
+    solver = VolumeAdmm(CAMERA, SensorData(np.zeros_like(DATA), VALID), volume_tv())
+    for _ in range(4):
+        assert solver.advance().objective == 0
+    assert not solver.solution.any()
+
+
 def test_a_volumes_solver_takes_one_channel() -> None:
     colours = Convolution(np.repeat(CAMERA_PSFS, 3, axis=1), SENSOR, dtype=np.float64)
     with pytest.raises(ValueError, match="One channel at a time, not 3"):
