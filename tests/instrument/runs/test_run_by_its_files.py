@@ -46,6 +46,14 @@ def test_a_recordings_period_counts_lost_frames_from_whatever_its_first_is(tmp_p
     assert Run.open(recorded(tmp_path, 2, 3, 7)).frame_period_s == pytest.approx(0.02)
 
 
+def test_frames_that_were_lost_at_the_end_have_their_place(tmp_path: Path) -> None:
+    with RunWriter.create(tmp_path, label="r", bench=BENCH) as writer:
+        writer.write([frame(0)])
+        writer.gap(Gap(1, 2, 0))
+        run = writer.finish(FinishReason.COMPLETED)
+    assert (run.n_frames, run.missing(), run.array.n_frames) == (3, [1, 2], 3)
+
+
 def test_a_run_starts_before_its_first_step_with_what_the_bench_had(tmp_path: Path) -> None:
     with new_run(tmp_path) as writer:
         start = Run.open(writer.path).start

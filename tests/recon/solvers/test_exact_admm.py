@@ -341,6 +341,18 @@ def test_what_a_start_casts_on_a_device_is_what_it_casts_on_the_host() -> None:
         np.testing.assert_allclose(device.solution, host.solution, atol=1e-9)
 
 
+@pytest.mark.parametrize("balance", [True, False])
+def test_a_volumes_penalty_is_balanced_after_iterations_that_are_due(balance: bool) -> None:
+    solver = VolumeAdmm(CAMERA, SensorData(DATA, VALID), volume_tv(), tuning=Tuning(balance=balance))
+    changed, before = [], solver.penalty
+    for iteration in range(9):
+        solver.advance()
+        if solver.penalty != before:
+            changed.append(iteration)
+        before = solver.penalty
+    assert changed == ([2, 4, 6, 8] if balance else [])
+
+
 def test_of_nothing_a_volume_stays_nothing() -> None:
     solver = VolumeAdmm(CAMERA, SensorData(np.zeros_like(DATA), VALID), volume_tv())
     for _ in range(4):
