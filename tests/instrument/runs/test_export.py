@@ -162,10 +162,11 @@ def test_hdf5(run: Run, tmp_path: Path) -> None:
 
 
 def test_png(run: Run, tmp_path: Path) -> None:
-    export(run, tmp_path / "pictures")
-    names = sorted(path.name for path in (tmp_path / "pictures").iterdir())
+    folder = tmp_path / "of" / "pictures"
+    export(run, folder)
+    names = sorted(path.name for path in folder.iterdir())
     assert names == [f"frame-{i}.png" for i in STORED]
-    read = cv2.imread(str(tmp_path / "pictures" / "frame-4.png"), cv2.IMREAD_UNCHANGED)
+    read = cv2.imread(str(folder / "frame-4.png"), cv2.IMREAD_UNCHANGED)
     assert np.array_equal(read[..., ::-1] if read.ndim == 3 else read, run.frame(4))
 
 

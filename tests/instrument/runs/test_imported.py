@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from datetime import timedelta
 from pathlib import Path
 
 import numpy as np
@@ -89,6 +90,7 @@ def test_colour_and_floats_and_what_is_said_over_what_the_file_tells(tmp_path: P
         run = import_film(film, tmp_path / f"runs-{kind}", "x", said, lambda *n: done.append(n))
         np.testing.assert_array_equal(run.frame(3), film.pixels[3])
         assert run.frame_period_s == pytest.approx(0.04)
+        assert run.metadata(3).utc - run.metadata(0).utc == timedelta(seconds=0.12)
         assert run.provenance["pixel_pitch_um"] == 3.0
         assert run.metadata(0).pixel_format == kind
     assert done == [(4, 4)] * 2

@@ -10,10 +10,12 @@ from typing import Any
 import numpy as np
 import pytest
 
+from recon import Calibration
 from recon.streams import live as live_module
+from recon.streams.live import LiveReconstructor
 from recon.streams.pace import Spent
 from recon.streams.stillness import SceneState
-from tests.recon.live.streams import SHAPE, live
+from tests.recon.live.streams import NOISE, SHAPE, live, spots_psf
 
 NEW, MOVING, STILL = SceneState
 MEAN = np.random.default_rng(0).random((1, *SHAPE)).astype(np.float32)
@@ -254,3 +256,10 @@ def test_what_was_made_in_the_dark_is_made_anew_once_there_is_light(
     assert reconstructor._level == (Noticing(sees=True, lit=True) if made else level)
     assert seen == [(1, reconstructor._scene, 7)] * 2 * level.sees
     assert reconstructor.warnings == (*before, *["look"] * level.sees)
+
+
+def test_of_all_depths_together_none_is_said_to_fit() -> None:
+    psfs = np.stack([spots_psf((32, 40), n) for n in (5, 8)])[:, None]
+    calibration = Calibration(psfs, np.array([[0.0, 0.0, 1e4], [0.0, 0.0, 2e4]]))
+    together = LiveReconstructor(calibration, noise=NOISE, coarsest=1)
+    assert together.fitting_depth_um(np.zeros((32, 40), np.float32)) is None
