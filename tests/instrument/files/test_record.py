@@ -17,7 +17,7 @@ import pytest
 
 from drivers.frame import FrameMetadata
 from instrument.files.errors import FileError, percent
-from instrument.files.record import RecordFormat, plain, value_of
+from instrument.files.record import RecordFormat, of_kind, plain, value_of
 from recon.arrays import Float64Array
 
 TEA = RecordFormat(
@@ -259,3 +259,10 @@ def test_metadata_of_frames_come_back() -> None:
 )
 def test_shares_are_neither_nothing_nor_all_by_rounding(share: float, words: str) -> None:
     assert percent(share) == words
+
+
+def test_a_number_that_no_float_holds_is_none_where_one_is_expected() -> None:
+    with pytest.raises(TypeError, match="'gain' is a whole number of more than 300 digits"):
+        of_kind(10**400, float, "gain")
+    assert of_kind(10**400, int, "gain") == 10**400
+    assert of_kind(10**300, float, "gain") == 10**300
