@@ -85,6 +85,8 @@ def test_a_result_shows_draws_and_saves_itself(scene: tuple[np.ndarray, np.ndarr
     page = found._repr_html_()
     assert "data:image/png;base64" in page
     assert "Verdict" in page
+    with pytest.raises(db.BenchError, match="plot draws into Matplotlib axes"):
+        found.plot("scene.png")
     axes = found.plot(rotate_deg=180)
     assert axes.images[0].get_array().shape == (48, 48)
     for name in ("a.npy", "a.png", "b.tif"):
@@ -214,6 +216,7 @@ def test_options_are_completed_and_nothing_is_ignored(scene: tuple[np.ndarray, n
         ({"dark": 30}, "arrays are taken as they are"),
         ({"iteration": 3}, "Did you mean 'iterations'"),
         ({"bin": 2}, "It is called 'binning'"),
+        ({"weight": 0.1}, "Did you mean 'tau'"),
         ({"z_mm": 2}, "It is called 'z_um', in um"),
         ({"prior": db.L1}, r"an object, not its class: L1\(\.\.\.\)"),
         ({"warm": psf}, "a result to start from, not ndarray: warm=result"),

@@ -23,7 +23,7 @@ from typer.core import TyperCommand
 
 from instrument.files.errors import BenchError
 from instrument.tasks.task import Given, guarded, part_of
-from recon.base.declare import RARE, Option
+from recon.base.declare import OTHER_NAMES, RARE, Option
 from recon.base.option_text import help_text, metavar, read
 from recon.errors import InputError
 
@@ -62,12 +62,13 @@ class GroupedCommand(TyperCommand):
             raise
 
     def _suggest(self, error: Any, unknown: str) -> None:
-        """Name the option that is meant where only capitals differ, or its name is that in Python."""
+        """Name the option that is meant: in other capitals, by its name in Python or in other programs."""
         meant = unknown.lstrip("-").casefold().replace("_", "-")
+        called = {meant, OTHER_NAMES.get(meant, meant)}
         for option in self.params:
             flags = [flag for flag in option.opts if flag.startswith("--")]
             known = [str(option.name).rpartition("__")[2].replace("_", "-"), *(flag[2:] for flag in flags)]
-            if flags and meant in known:
+            if flags and called & set(known):
                 error.possibilities = [flags[0]]
 
     def _wanted(self, argument: Any) -> str:

@@ -82,6 +82,10 @@ def _unreadable(path: Path, beginning: bytes) -> str:
     return f"is no image that can be read, or is damaged. Readable: {READABLE}."
 
 
+_PACKED = (".docx", ".pptx", ".xlsx", ".odt", ".odp", ".ods")
+"""Of files that are packed as .npz files are, and hold other things."""
+
+
 def decode(path: Path, inside: str, expect: Expect) -> Decoded:
     """Return a file's array; its content, not its name, tells the format.
 
@@ -104,7 +108,7 @@ def decode(path: Path, inside: str, expect: Expect) -> Decoded:
         return read_hdf5(path, inside, of_matlab=beginning.startswith(b"MATLAB"), expect=expect)
     if is_matlab(beginning):
         return read_matlab(path, inside, expect=expect)
-    if beginning.startswith(b"PK"):
+    if beginning.startswith(b"PK") and path.suffix.lower() not in _PACKED:
         return _decode_npz(path, inside, expect)
     if inside:
         raise FileError(path, f"is no HDF5, MATLAB or .npz file, so that nothing in it is called {inside}.")

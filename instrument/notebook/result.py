@@ -92,6 +92,8 @@ class Result(Reconstruction):
             from matplotlib import pyplot
 
             axes = pyplot.subplots()[1]
+        elif not hasattr(axes, "imshow"):
+            raise BenchError(f"plot draws into Matplotlib axes (pyplot.subplots()[1]), not {axes!r:.60}.")
         axes.imshow(self.seen(rotate_deg=rotate_deg), cmap="gray", vmin=0, vmax=255)
         axes.set_axis_off()
         axes.set_title(_title(self), fontsize=9)

@@ -357,12 +357,20 @@ def with_overrides(options: _T, overrides: Mapping[str, Any]) -> _T:
     return dataclasses.replace(options, **overrides) if overrides else options  # type: ignore[type-var]
 
 
+OTHER_NAMES = {
+    **dict.fromkeys(("weight", "lambda", "lam", "regularization", "regularisation"), "tau"),
+    "output": "out",
+}
+"""What other programs call an option; too far from its name here to be guessed."""
+
+
 def require_known(names: Iterable[str], *classes: type) -> None:
     """Raise InputError for a name that is no option of these classes, with the one that may be meant."""
     known = [field.name for cls in classes for field in dataclasses.fields(cls)]
     for name in names:
         if name not in known:
-            near = difflib.get_close_matches(name, known, 1)
+            meant = OTHER_NAMES.get(name)
+            near = [meant] if meant in known else difflib.get_close_matches(name, known, 1)
             hint = f" Did you mean {near[0]!r}?" if near else f" There are {', '.join(known)}."
             flag = f"--{name.replace('_', '-')}"  # an old name goes on working on the command line
             if new := next((o for cls in classes for o in options_of(cls) if flag in o.flags), None):

@@ -159,9 +159,15 @@ def test_a_missing_argument_is_described_with_an_example(
 
 @pytest.mark.parametrize(
     ("typed", "meant"),
-    [("--PSF psf.tif", "--psf"), ("--mosaic rggb", "--bayer"), ("--warm-iterations 3", "--warm")],
+    [
+        ("--PSF psf.tif", "--psf"),
+        ("--mosaic rggb", "--bayer"),
+        ("--warm-iterations 3", "--warm"),
+        ("--lambda 0.1", "--tau"),
+        ("--output scene.tif", "--out"),
+    ],
 )
-def test_an_option_in_capitals_or_by_its_name_in_python_is_found(
+def test_an_option_in_capitals_or_by_another_name_is_found(
     typed: str, meant: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert main(["reconstruct", *typed.split()]) == 2
