@@ -244,8 +244,12 @@ def test_a_plan_without_slm_images_makes_no_folder_for_them_and_others_are_copie
 
 
 def test_a_broken_checkout_has_no_commit(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def answer(*_: object, **how: object) -> SimpleNamespace:
+        assert (how["capture_output"], how["text"], how["check"]) == (True, True, True)
+        return SimpleNamespace(stdout="abc-dirty\n")
+
     with monkeypatch.context() as answered:
-        answered.setattr(writer.subprocess, "run", lambda *_, **how: SimpleNamespace(stdout="abc-dirty\n"))
+        answered.setattr(writer.subprocess, "run", answer)
         assert writer.git_commit() == ("abc-dirty" if (Path(__file__).parents[3] / ".git").exists() else None)
     monkeypatch.setattr(writer, "__file__", str(tmp_path / "instrument" / "runs" / "writer.py"))
     assert writer.git_commit() is None
