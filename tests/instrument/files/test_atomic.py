@@ -308,3 +308,12 @@ def test_a_file_that_could_not_be_written_is_refused_before_the_work(
             atomic.check_writable(tmp_path / name, 1000)
     else:
         atomic.check_writable(tmp_path / name, 1000)
+
+
+def test_of_an_array_of_a_file_the_file_is_held(tmp_path: Path) -> None:
+    (tmp_path / "all.npz").touch()
+    (tmp_path / "named::so.npy").touch()
+    with atomic.protecting([Path(f"{tmp_path}/all.npz::psfs"), tmp_path / "named::so.npy"]):
+        for name in ("all.npz", "named::so.npy"):
+            with pytest.raises(FileError, match="is an input itself"):
+                atomic.refuse_input(tmp_path / name)

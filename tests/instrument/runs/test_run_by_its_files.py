@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 from instrument.files.calibration_file import CALIBRATION_FILES, save_calibration
+from instrument.files.errors import FileError
 from instrument.files.images import write_image
 from instrument.runs.export import _told
 from instrument.runs.inspection import verify
@@ -20,7 +21,7 @@ from instrument.runs.recording_rest import rest_of
 from instrument.runs.repair import file_problems
 from instrument.runs.results import result_problems
 from instrument.runs.run import FinishReason, Run
-from instrument.runs.run_files import RunError, RunFiles, log_size, refuse_within
+from instrument.runs.run_files import RunError, RunFiles, log_size, refuse_own_files, refuse_within
 from instrument.runs.writer import RunWriter
 from recon.types import Calibration
 from tests.instrument.files.test_atomic import open_below
@@ -272,3 +273,13 @@ def test_a_damaged_result_is_told_by_its_name_and_at_a_look_where_that_reads_it(
     assert bool(result_problems(made, read=False)) is at_a_look
     assert [one.of for one in result_problems(made, read=False, noted=[of])] == [of]
     assert bool(result_problems(made, read=False, noted=["another"])) is at_a_look
+
+
+def test_a_runs_own_file_is_not_written_to_by_another_name_either(tmp_path: Path) -> None:
+    path = recorded(tmp_path, 0)
+    (path / "mine.json").hardlink_to(path / "state.json")
+    for name in ("state.json", "mine.json", "frames.ome.zarr/0/more"):
+        with pytest.raises(FileError, match=r"is a run, and .* is part of it; no output replaces it"):
+            refuse_own_files(path / name)
+    refuse_own_files(path / "notes.txt")
+    refuse_own_files(tmp_path / "state.json")
