@@ -14,7 +14,7 @@ import pytest
 from instrument.files.calibration_file import CALIBRATION_FILES, save_calibration
 from instrument.files.errors import FileError
 from instrument.files.images import write_image
-from instrument.runs.export import _told
+from instrument.runs.export import _told, export
 from instrument.runs.inspection import verify
 from instrument.runs.log import Gap
 from instrument.runs.recording_rest import rest_of
@@ -79,6 +79,8 @@ def test_a_look_at_sizes_reads_what_was_noted_as_damaged_and_no_more(tmp_path: P
     whole = chunk.read_bytes()
     chunk.write_bytes(bytes(len(whole)))
     assert Run.open(path).damaged(read=False) == ()
+    with pytest.raises(RunError, match="frame 1 is damaged: its file has the CRC-32"):
+        Run.open(path).frame(1)
     done: list[tuple[int, int]] = []
     assert [one.index for one in Run.open(path).damaged(lambda *n: done.append(n))] == [1]
     assert done == [(1, 3), (2, 3), (3, 3)]
@@ -283,3 +285,8 @@ def test_a_runs_own_file_is_not_written_to_by_another_name_either(tmp_path: Path
             refuse_own_files(path / name)
     refuse_own_files(path / "notes.txt")
     refuse_own_files(tmp_path / "state.json")
+
+
+def test_pictures_of_a_run_have_names_of_one_length(tmp_path: Path) -> None:
+    export(Run.open(recorded(tmp_path, 3, 10)), tmp_path / "pictures")
+    assert sorted(one.name for one in (tmp_path / "pictures").iterdir()) == ["frame-03.png", "frame-10.png"]
