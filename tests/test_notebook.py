@@ -85,6 +85,8 @@ def test_a_result_shows_draws_and_saves_itself(scene: tuple[np.ndarray, np.ndarr
     page = found._repr_html_()
     assert "data:image/png;base64" in page
     assert "Verdict" in page
+    with pytest.raises(AttributeError, match=r"no attribute 'sav'\. Did you mean 'save'"):
+        found.sav  # noqa: B018
     with pytest.raises(db.BenchError, match="plot draws into Matplotlib axes"):
         found.plot("scene.png")
     axes = found.plot(rotate_deg=180)

@@ -30,6 +30,7 @@ from instrument.reconstruction.result_file import (
 )
 from recon.arrays import Array
 from recon.base.arguments import require_argument
+from recon.base.handed_on import lacking
 from recon.reconstruction.result import Reconstruction
 from recon.types import Calibration
 
@@ -62,6 +63,11 @@ class Result(Reconstruction):
         told = result_in_python(found)
         values = {f.name: getattr(told, f.name) for f in fields(Reconstruction)}
         return cls(**values, job=job_in_python(job), typed=(found, job))
+
+    if not TYPE_CHECKING:
+
+        def __getattr__(self, name: str) -> Any:
+            raise lacking(self, name)
 
     def __array__(self, dtype: npt.DTypeLike | None = None, copy: bool | None = None) -> Array:
         """Return the picture's pixels, (height, width) or with colours last; of a volume all its planes."""

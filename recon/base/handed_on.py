@@ -50,3 +50,14 @@ def handed_on(names: MutableMapping[str, Any]) -> tuple[dict[str, tuple[str, str
         return value
 
     return homes, found
+
+
+def lacking(owner: object, name: str) -> AttributeError:
+    """Return the error of an object that lacks an attribute, with the nearest one: IPython names none."""
+    import difflib
+
+    public = [known for known in dir(type(owner)) if known[0] != "_"]
+    near = difflib.get_close_matches(name, public, 1) if name[:1] != "_" else []
+    hint = f" Did you mean {near[0]!r}?" if near else ""
+    said = f"{type(owner).__name__!r} object has no attribute {name!r}.{hint}"
+    return AttributeError(said, name=name, obj=owner)
