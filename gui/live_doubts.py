@@ -24,7 +24,7 @@ class LiveDoubts:
     def of(self, result: LiveResult, depth_words: str) -> str:
         """Return what is doubtful, or not known yet, by a picture's pixels, its depth, and its frame."""
         of_pixels = result.picture.said
-        if of_pixels and self._session.lights.during(result.metadata) == NOTHING_LIT:
+        if result.picture.doubt and self._session.lights.during(result.metadata) == NOTHING_LIT:
             return of_pixels  # which says it
         said = ". ".join(filter(None, (self.of_frame(result.metadata), depth_words or of_pixels)))
         return with_signs(said)

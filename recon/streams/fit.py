@@ -140,7 +140,7 @@ class _Stage:
             return at
         left_s = (time.monotonic() - self._begun_s) * (1 - share) / share
         rounded = next((told for told in ROUNDED_S if left_s <= told), None)
-        return f"{at}, " + ("over a minute more" if rounded is None else f"up to about {rounded} s more")
+        return f"{at}, " + ("over a minute more" if rounded is None else f"some {rounded} s more")
 
 
 class _Found(NamedTuple):

@@ -179,7 +179,7 @@ def test_until_a_check_has_ended_it_is_said_what_is_looked_at_and_for_how_long(
     watch.see(lambda: posed, 1, SceneState.STILL, 1)
     assert asked.wait(20)
     so_far = "so far its PSF explains the photograph better mirrored (looked at again)"
-    assert watch.awaited == f"{fit.NOT_JUDGED}: {so_far}, up to about 10 s more"
+    assert watch.awaited == f"{fit.NOT_JUDGED}: {so_far}, some 10 s more"
     assert not watch.doubt, "it may be cleared"
     told.set()
     watch.wait()
