@@ -89,8 +89,7 @@ def files(tmp_path):
     return tmp_path
 
 
-@pytest.mark.parametrize("bayer", ["GRBG", "auto"])
-@pytest.mark.parametrize("binning", [1, 2])
+@pytest.mark.parametrize(("bayer", "binning"), [("auto", 1), ("GRBG", 2)])
 def test_a_raw_frame_gives_a_picture_in_its_colours(files, bayer, binning, capsys):
     out = files / "out.tif"
     arguments = [
