@@ -124,6 +124,8 @@ def main() -> int:
     n = len(trials.fates)
     print(f"{share:.1%} of {n} noticed (seed {options.seed}); {len(known_equal())} are known to be equal.")
     print(f"Without a mutant: {trials.alone} processes, {trials.failed_alone} failed.")
+    if trials.not_possible:
+        print(f"{trials.not_possible} could not be put into the program.")
     if left := len(chosen) - n - trials.not_possible:
         print(f"{left} were not tried for want of time.")
     return int(share < ENOUGH)

@@ -131,12 +131,7 @@ class Trials:
         for module in self._modules:  # what is imported when it is used, too
             importlib.import_module(module.removesuffix(".py").replace("/", "."))
         _load_kernels({Path("recon/base"), *(Path(module).parent for module in self._modules)})
-        gc.collect()
-        self._functions = defaultdict(list)
-        for function in gc.get_objects():
-            if type(function) is FunctionType:
-                code = function.__code__
-                self._functions[code.co_filename, code.co_qualname, code.co_firstlineno].append(function)
+        self._functions = _functions()
         assert threading.active_count() == 1, "a process with threads cannot be doubled"
         watched = self._watch(session)
         bad = [name for name, test in watched.items() if not test.passed]
@@ -259,7 +254,7 @@ class Trials:
         """Run tests with a mutant until one fails; whether it lived."""
         if mutant is not None:
             file = str(self._root / mutant.path)
-            functions = self._functions[file, mutant.function, mutant.first_line]
+            functions = self._functions.get((file, mutant.function, mutant.first_line))
             if not functions:
                 return "not possible"
             try:
@@ -325,6 +320,19 @@ class Trials:
     def pytest_configure(self, config: pytest.Config) -> None:
         """Keep what knows the temporary folders."""
         self._config = config
+
+
+def _functions() -> dict[tuple[str, str, int], list[FunctionType]]:
+    """Return every function that is loaded, by file, qualified name and first line."""
+    gc.unfreeze()  # what tests/conftest.py keeps out of collections is not among their objects
+    gc.collect()
+    found = defaultdict(list)
+    for function in gc.get_objects():
+        if type(function) is FunctionType:
+            code = function.__code__
+            found[code.co_filename, code.co_qualname, code.co_firstlineno].append(function)
+    gc.freeze()
+    return found
 
 
 def _waited_s() -> float:

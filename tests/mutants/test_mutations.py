@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import os
 import time
 from pathlib import Path
@@ -12,7 +13,7 @@ import pytest
 from tests.mutants.__main__ import known_equal
 from tests.mutants.areas import AREAS
 from tests.mutants.mutations import mutants_of
-from tests.mutants.session import Trials, Watched, _digest, _Kept
+from tests.mutants.session import Trials, Watched, _digest, _functions, _Kept
 
 TEXT = '''
 class A:
@@ -72,6 +73,12 @@ def test_what_is_said_to_be_equal_is_still_in_the_program() -> None:
     root = Path(__file__).parents[2]
     names = {m.name for paths, _ in AREAS.values() for path in paths for m in mutants_of(Path(path), root)}
     assert not set(known_equal()) - names
+
+
+def test_a_function_is_found_though_it_is_kept_out_of_collections() -> None:
+    code = mutants_of.__code__
+    gc.freeze()
+    assert _functions()[code.co_filename, "mutants_of", code.co_firstlineno] == [mutants_of]
 
 
 def test_tests_are_watched_again_once_their_file_or_their_names_changed(tmp_path: Path) -> None:
