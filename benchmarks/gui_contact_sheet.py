@@ -71,11 +71,13 @@ def main() -> int:
             tiles[name, state, theme] = picture.scaledToWidth(
                 given.tile, Qt.TransformationMode.SmoothTransformation
             )
-            found += [f"{state}, {name}, {theme}: {fault}" for fault in wrong]
+            told = [f"{state}, {name}, {theme}: {fault}" for fault in wrong]
+            told = [fault for fault in dict.fromkeys(told) if fault not in found]
+            print("".join(f"{fault}\n" for fault in told), end="", flush=True)
+            found += told
     _sheet(tiles).save(str(given.out), quality=85)
     print(given.out)
-    found = list(dict.fromkeys(found))
-    print("\n".join([*found, f"{len(found)} faults in {len(tiles)} pictures"]))
+    print(f"{len(found)} faults in {len(tiles)} pictures")
     return 1 if found else 0
 
 

@@ -424,6 +424,7 @@ class ReconstructionsPanel(Panel):
         if path.is_dir() and form.kind == PSF:
             form.options.set_values({"kind": CALIBRATION})
         form.options.set_values({form.source if path.is_dir() else "image": path})
+        form.start.setFocus()  # Return does what one came for
         if not path.is_dir() and not form.text(form.source) and form.kind != PSF:
             folder = self.session.runs_folder
             self._newest.ask(lambda: newest_calibration(folder), self._offer_calibration)
