@@ -12,8 +12,8 @@ from calibration_routines.optics.photograph import PHOTOGRAPH
 from calibration_routines.plan_procedures import can_go_on, why_no_result
 from calibration_routines.psf.sweep_plan import SWEEP
 from drivers.frame import FrameMetadata
-from gui.widgets.entry import quantity
 from gui.widgets.image_view import usual_levels
+from gui.words import quantity
 from instrument.bench.photograph import Progress
 from instrument.bench.photograph_file import read_snapshot
 from instrument.files.errors import percent

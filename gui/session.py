@@ -22,8 +22,7 @@ from gui.background import NewestOnly
 from gui.jobs import BusyError, Job, JobContext, JobRunner, Work, joined, words_for
 from gui.live_upkeep import LiveUpkeep
 from gui.session_news import DeviceState, LogBridge, OperatorRequest, is_gone, name_of
-from gui.widgets.entry import quantity
-from gui.words import in_the_log, in_the_window
+from gui.words import in_the_log, in_the_window, quantity
 from instrument.bench.bench import Bench
 from instrument.bench.config import BenchConfig, Kind
 from instrument.bench.kept import KeptWithBench

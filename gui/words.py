@@ -1,4 +1,4 @@
-"""The terminal's commands in messages, as what does the same in the window."""
+"""How the window says things: what commands are called here, signs, and numbers with their units."""
 
 from __future__ import annotations
 
@@ -49,6 +49,9 @@ _SIGNS = (
     (re.compile(r"\bopen it again\b"), "reconnect it"),
 )
 """Units and signs as the window has them, and what its buttons say: a terminal may lack both."""
+_MM_UM = 1e3
+THIN = "\u2009"
+"""Between groups of three digits."""
 
 
 def in_the_window(text: str) -> str:
@@ -95,3 +98,23 @@ def _ways() -> tuple[Mapping[str, str], re.Pattern[str]]:
     ways["reconstruct --video"] = ways["video"]
     names = "|".join(map(re.escape, sorted(ways, key=len, reverse=True)))
     return ways, re.compile(rf"'(?:diffuserbench )?({names}){_REST}'|\bdiffuserbench ({names})\b{_REST}")
+
+
+def grouped(digits: str) -> str:
+    """Return a number's digits with thin spaces between thousands, from five digits before the point on."""
+    whole, point, rest = digits.partition(".")
+    bare = whole.lstrip("-")
+    if len(bare) < 5 or not bare.isdecimal():
+        return digits
+    return f"{int(whole):,}".replace(",", THIN) + point + rest
+
+
+def quantity(value: float, unit: str, digits: int = 4) -> str:
+    """Return a number with its unit as people read it: lengths from 1 mm on in mm, thousands apart."""
+    unit = "µm" if unit == "um" else unit
+    if unit == "µm" and abs(value) >= _MM_UM:
+        value, unit = value / _MM_UM, "mm"
+    written = f"{value:.{digits}g}"
+    if "e+" in written:
+        written = f"{value:.0f}"
+    return f"{grouped(written)} {unit}".strip()

@@ -17,9 +17,10 @@ from gui.panel import DevicePanel, on_bench
 from gui.session import BenchSession
 from gui.widgets.building import button, fill, in_column, in_row, label, mark, share_bar
 from gui.widgets.dialogues import Question
-from gui.widgets.entry import NumberEdit, grouped, quantity
+from gui.widgets.entry import NumberEdit
 from gui.widgets.image_view import step_factor
 from gui.widgets.kept_bar import KeptBar
+from gui.words import grouped, quantity
 from instrument.plan import Plan
 from recon.base.as_python import Imports
 

@@ -191,7 +191,7 @@ class CameraForm(QWidget):
             return
         if name == "roi" and asked is not None and asked != state.roi:
             now, wanted = (", ".join(map(str, region.as_tuple())) for region in (state.roi, asked))
-            self._session.log("info", f"The camera reads region {now}, the nearest to {wanted}.")
+            self._session.log("info", f"The camera reads region {now}; {wanted} was asked for.")
         self._panel.accepted()  # what Auto could not do in the settings before is over, too
         if isinstance(widget, QLineEdit):
             widget.setModified(False)

@@ -13,6 +13,7 @@ from PySide6.QtWidgets import QLineEdit, QWidget
 
 from gui.widgets.building import button, fill, mark
 from gui.widgets.dialogues import Browse, choose_path
+from gui.words import THIN, grouped
 from instrument.files.errors import BenchError
 
 
@@ -157,28 +158,6 @@ _LETTERS = "abcdefghijklmnopqrstuvwxyzABCDEFGHIJKLMNOPQRSTUVWXYZµ×%/° "
 
 
 _LONGEST_ABBREVIATION = 3
-THIN = "\u2009"
-"""Between groups of three digits."""
-
-
-def grouped(digits: str) -> str:
-    """Return a number's digits with thin spaces between thousands, from five digits before the point on."""
-    whole, point, rest = digits.partition(".")
-    bare = whole.lstrip("-")
-    if len(bare) < 5 or not bare.isdecimal():
-        return digits
-    return f"{int(whole):,}".replace(",", THIN) + point + rest
-
-
-def quantity(value: float, unit: str, digits: int = 4) -> str:
-    """Return a number with its unit as people read it: lengths from 1 mm on in mm, thousands apart."""
-    unit = "µm" if unit == "um" else unit
-    if unit == "µm" and abs(value) >= _MM_UM:
-        value, unit = value / _MM_UM, "mm"
-    written = f"{value:.{digits}g}"
-    if "e+" in written:
-        written = f"{value:.0f}"
-    return f"{grouped(written)} {unit}".strip()
 
 
 def _one(unit: str) -> str:

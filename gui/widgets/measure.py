@@ -10,8 +10,8 @@ from PySide6.QtCore import QObject, QPointF, QRectF, Signal
 from PySide6.QtWidgets import QGraphicsRectItem
 
 from gui.theme import colours
-from gui.widgets.entry import quantity
 from gui.widgets.image_view import ImageView
+from gui.words import quantity
 from recon.arrays import Array
 
 _BAR_SHARE = 0.25

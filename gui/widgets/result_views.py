@@ -16,10 +16,10 @@ from PySide6.QtWidgets import QCheckBox, QGridLayout, QTextBrowser, QWidget
 from gui.session import BenchSession
 from gui.theme import colours
 from gui.widgets.building import button, choice, fill, in_row, label
-from gui.widgets.entry import quantity
 from gui.widgets.image_view import ImageView
 from gui.widgets.orientation import OrientationButton, follow_orientation
 from gui.widgets.plots import LevelsBar, curve_pen, legend, plot_widget
+from gui.words import quantity
 from instrument.files.orientation import AS_IT_IS, Orientation
 from recon.arrays import Float32Array
 from recon.solvers.base import IterationRecord

@@ -14,9 +14,9 @@ from gui.background import NewestOnly
 from gui.jobs import Job, JobContext, JobRunner
 from gui.theme import as_shown, colours, luminance, spares_hues, table
 from gui.widgets.building import button, every, fill, in_row, label, share_bar
-from gui.widgets.entry import quantity
 from gui.widgets.image_view import ArrowKeys
 from gui.widgets.measure import round_length
+from gui.words import quantity
 from instrument.reconstruction.rendering import Pose, Renderer, depth_shades
 from instrument.reconstruction.result_figures import Projections, in_colour_of_depth
 from instrument.volumes.source import Plane, VolumeSource

@@ -314,7 +314,7 @@ def test_a_region_that_the_camera_rounds_is_told(qtbot: QtBot, live: LivePanel) 
     _type_only(qtbot, field, "10, 20, 100, 150")
     qtbot.keyClick(field, Qt.Key.Key_Return)
     qtbot.waitUntil(lambda: field.text() == "12, 20, 96, 148", timeout=WAIT_MS)
-    assert "The camera reads region 12, 20, 96, 148, the nearest to 10, 20, 100, 150." in said
+    assert "The camera reads region 12, 20, 96, 148; 10, 20, 100, 150 was asked for." in said
 
 
 def test_slow_frames_have_their_time_told_and_no_rate_of_two_seconds(live: LivePanel) -> None:

@@ -7,7 +7,8 @@ from PySide6.QtCore import QEvent, Qt
 from PySide6.QtGui import QFocusEvent
 from pytestqt.qtbot import QtBot
 
-from gui.widgets.entry import Entry, NumberEdit, existing_path, grouped, quantity
+from gui.widgets.entry import Entry, NumberEdit, existing_path
+from gui.words import grouped, quantity
 
 
 def _field(qtbot: QtBot, unit: str = "ms", value: float | None = 10.0, **limits: float) -> NumberEdit:

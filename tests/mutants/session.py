@@ -273,8 +273,8 @@ class Trials:
     def _fork(self, work: Callable[[], object], limit_s: float) -> _Child:
         """Do something in a process of its own, with its own temporary folder.
 
-        It has ``limit_s`` of the processor, and on the clock as much longer as others crowd the machine: what
-        ends it counts as noticed.
+        It has ``limit_s`` of the processor, and on the clock as much longer as others crowd the machine, up
+        to an hour: what ends it counts as noticed.
         """
         self._number += 1
         answer = self._folder / str(self._number)
@@ -283,7 +283,7 @@ class Trials:
         if process:
             self._alive.add(process)
             crowd = max(2 * os.getloadavg()[0] / (os.cpu_count() or 1), 1.0)
-            return _Child(process, answer, time.monotonic() + crowd * limit_s)
+            return _Child(process, answer, time.monotonic() + max(min(crowd * limit_s, 3600), limit_s))
         try:
             os.setpgid(0, 0)
             signal.signal(signal.SIGTERM, signal.SIG_DFL)
