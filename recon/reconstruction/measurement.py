@@ -21,6 +21,7 @@ from recon.base.checks import (
     select_psf,
 )
 from recon.base.noise import NoiseModel, estimate_deviation
+from recon.base.unseen import unseen_lines
 from recon.camera.camera_model import Depths, members_of_depths, one_depth, sort_by_depth
 from recon.camera.field_registration import one_psf
 from recon.errors import InputError
@@ -118,6 +119,24 @@ class Measurement:
         masked = " or masked" if np.ma.is_masked(self.image) else ""
         said = f"{np.count_nonzero(holes)} pixels of the measurement are NaN{masked}: they are erased."
         return replace(self, image=filled, erasures=np.maximum(erased, holes)), said
+
+    def with_unseen_erased(self) -> tuple[Measurement, str]:
+        """Return it with frames and covered parts erased, and that in words; itself and no words without any.
+
+        Such are outer rows and columns of one value (:mod:`recon.base.unseen`); not under patterns.
+        """
+        if self.patterns is not None:
+            return self, ""
+        channels = self.channels()
+        erased = np.zeros(channels.shape, bool) if self.erasures is None else self._erased(channels)
+        if not (unseen := unseen_lines(channels, ~erased)).any():
+            return self, ""
+        said = (
+            f"{np.mean(unseen):.1%} of the measurement's pixels lie in outer rows and columns of one value "
+            "each: a frame, or a part that was covered or not read. They are erased."
+        )
+        both = erased | unseen
+        return replace(self, erasures=both[0] if self.flat else np.moveaxis(both, 0, -1)), said
 
     def channels(self) -> Float32Array:
         """Return the image as it came, channels first; under patterns each channel's frames in turn."""

@@ -131,6 +131,7 @@ class Problem:
         _require(options)
         measurement = measurement if isinstance(measurement, Measurement) else Measurement(measurement)
         measurement, holes = measurement.with_holes_erased()
+        measurement, unseen = measurement.with_unseen_erased()
         counts = measurement.counts()
         if not isinstance(calibration, Calibration):
             if options.model not in ("auto", "convolution"):
@@ -166,7 +167,7 @@ class Problem:
                 reason = "patterned light takes one PSF a depth where no other model is asked for"
         asked = True if options.positive_background else options.estimate_background
         unmoved = calibration.provenance.get("not_refocused")
-        said = (holes, unmoved and f"The PSF was {unmoved}.", *beyond_calibrated(calibration))
+        said = (holes, unseen, unmoved and f"The PSF was {unmoved}.", *beyond_calibrated(calibration))
         deviation = measurement.deviations(counts).astype(np.float32)
         problem = cls(
             measurement,

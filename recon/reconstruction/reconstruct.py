@@ -14,6 +14,7 @@ import numpy.typing as npt
 from recon.base.checks import require_photograph
 from recon.base.declare import with_overrides
 from recon.base.threads import linear_algebra_on_one_thread
+from recon.base.unseen import seen_window
 from recon.camera.camera_model import CAMERAS
 from recon.errors import InputError
 from recon.priors import PRIORS
@@ -217,7 +218,10 @@ def lacking(result: Reconstruction, problem: Problem) -> Missing | None:
     psfs = problem.depths.central[0]
     if psfs.shape[1:] != problem.sensor_shape:
         return None  # it was cut to where it has light
-    return missing_light(psfs, result.state[:, 0], *window_of("sensor", problem.sensor_shape, psfs.shape[1:]))
+    rows, columns = seen_window(psfs.mean(axis=0))
+    return missing_light(
+        psfs[:, rows, columns], result.state[:, 0], *window_of("sensor", problem.sensor_shape, psfs.shape[1:])
+    )
 
 
 def judged(
