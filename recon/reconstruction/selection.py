@@ -16,14 +16,12 @@ from recon.reconstruction.background import (
     BELOW_ZERO,
     DARKEST,
     DARKEST_PERCENTILE,
-    EXPLAINS,
     FLOOR,
     Trial,
     background_of,
     beyond_of,
     floor,
     trial_of,
-    with_light_restored,
 )
 from recon.reconstruction.choice import Choice
 from recon.reconstruction.colours import channels_of, merged
@@ -33,6 +31,7 @@ from recon.reconstruction.planes import BEYOND, between_of, no_beyond, planes_of
 from recon.reconstruction.probe import COARSE_PX, camera_cost, coarse_copy, coarse_passes, within_of
 from recon.reconstruction.problem import Problem, Stage
 from recon.reconstruction.reduction import on_blocks, reduced, reduced_calibration
+from recon.reconstruction.restored_light import EXPLAINS, with_light_restored
 from recon.reconstruction.rules import (
     SETTLED,
     USUAL_ITERATIONS,

@@ -18,18 +18,20 @@ from recon.reconstruction.background import (
     POINTS,
     VOLUME,
     Trial,
-    _least,
-    _offset_of,
-    _shade_of,
-    _Small,
     background_of,
     beyond_of,
     floor,
-    with_light_restored,
 )
 from recon.reconstruction.measurement import Measurement
 from recon.reconstruction.options import Overrides, ReconstructionOptions
 from recon.reconstruction.problem import Problem
+from recon.reconstruction.restored_light import (
+    _least,
+    _offset_of,
+    _shade_of,
+    _Small,
+    with_light_restored,
+)
 from recon.types import Calibration
 
 Counts = np.ndarray[Any, np.dtype[Any]]
