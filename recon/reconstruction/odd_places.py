@@ -1,4 +1,4 @@
-"""Places of a photograph that nothing explains: dust, reflections, a lamp's glow, what somebody wrote on it.
+"""Places of a photograph that nothing explains: dust, hairs, reflections of a lamp.
 
 Light through a PSF of any extent is everywhere or nowhere. Where a reconstruction leaves far more in a few
 places than anywhere else, and leaves no more than calibrated cameras do once it is made without them, they
@@ -25,15 +25,13 @@ FAR = 3.0
 deviations."""
 GAUSSIAN = 1.4826
 """Deviation over median magnitude."""
-ROUNDS = 2
-"""Of reconstructions without the places of the round before. The measured hand under dust, a lamp and a
-reflection takes one; what a cut PSF leaves is less each time."""
 MOST = 0.15
 """Share of the pixels that may be left out."""
 LEFT = 0.7
 """Mean square that is left without them, in units of what calibrated cameras leave, noise included, up to
 which they were all that is wrong. The hand under dust, a lamp, a reflection: 0.33 to 0.52 (2 to 32 with them;
-as it is 0.19); through a PSF cut to 70 % 1.2, raised to a power of 0.7 0.81, in bands 3.6, mirrored 20."""
+as it is 0.19); through a PSF cut to 70 % 1.8, raised to a power of 0.7 and 0.45 1.1, in bands 5.0, mirrored
+21. A second round would explain gamma-coded ones as well."""
 
 
 def odd_places(channels: Sequence[Problem], usual2: Float64Array, iterations: int) -> BoolArray | None:
@@ -50,7 +48,7 @@ def odd_places(channels: Sequence[Problem], usual2: Float64Array, iterations: in
     """
     odd = np.zeros(channels[0].sensor_shape, bool)
     seen = np.stack([channel.valid[0] for channel in channels])
-    for _ in range(1 + ROUNDS):
+    for _ in range(2):
         known = seen & ~odd
         left = [_left(c, k, iterations) for c, k in zip(channels, known, strict=True)]
         each = [float(np.mean(r[k] ** 2)) / u for r, k, u in zip(left, known, usual2, strict=True)]
