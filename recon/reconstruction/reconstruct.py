@@ -26,6 +26,7 @@ from recon.reconstruction.part import Part, parts_of
 from recon.reconstruction.pilot import HELD_OUT
 from recon.reconstruction.problem import Problem, Stage
 from recon.reconstruction.psf_refinement import refined
+from recon.reconstruction.residual import is_below_zero
 from recon.reconstruction.result import Reconstruction, window_of
 from recon.reconstruction.selection import choose
 from recon.reconstruction.solve import Progress, rules_of, solve
@@ -224,6 +225,14 @@ def lacking(result: Reconstruction, problem: Problem) -> Missing | None:
     )
 
 
+def _smooth_share(result: Reconstruction, problem: Problem) -> float:
+    """Return a picture's smooth background relative to the data's light; 0 of volumes."""
+    if result.background is None or problem.n_planes > 1:
+        return 0.0
+    light = float(np.mean((problem.data * problem.noise[:, None, None])[problem.valid], dtype=np.float64))
+    return float(np.mean(result.background)) / max(abs(light), 1e-30)
+
+
 def judged(
     result: Reconstruction,
     problem: Problem,
@@ -263,6 +272,9 @@ def judged(
             missing = lacking(small, problem)
             if missing is not None and missing.much:
                 verdict = verdict.with_cut_psf(missing.of_all / (1 + missing.of_all))
+            smooth = _smooth_share(small, problem)
+            if is_below_zero(smooth):
+                verdict = verdict.with_background_below_zero(smooth)
             what = "No pixels were held out"
             if unlike_any(verdict):
                 missed = held_out_error(small, problem, on_stage=tell, cancel=cancel)

@@ -30,13 +30,18 @@ def background_in_words(
     if background is None:
         return []
     share = _share(problem, background, channels)
-    if share > -NEGATIVE:
+    if not is_below_zero(share):
         return []
     return [
         f"The background came out negative ({share:.2f} of the data's light), which no light is: the PSFs "
         "may stand on an offset, or lack light at their edges, and the object has as much more. See whether "
         "their dark frame is right; --positive-background keeps it above zero."
     ]
+
+
+def is_below_zero(share: float) -> bool:
+    """Whether a background's share of the light is no light."""
+    return share <= -NEGATIVE
 
 
 def _share(problem: Problem, light: Array, channels: slice) -> float:

@@ -49,6 +49,11 @@ CUT_PSF = (
     "were cropped, give them whole; else a smaller scene in the middle would help, or a smaller pattern (a "
     "farther scene, a diffuser nearer to the sensor)"
 )
+BELOW_ZERO = (
+    "doubtful: the smooth background came out below zero, at {share:.0%} of the light, which no light is. "
+    "The PSF may stand on light of the room, and the picture has as much more: take the PSF in the dark and "
+    "with its dark frame"
+)
 NO_CASES = "not judged: there are no known cases of {method}"
 NOISELESS = 1e3
 """``signal`` from which the data are no photograph's: a full well of 100,000 electrons gives some 300."""
@@ -209,8 +214,13 @@ class Verdict:
         """Return the verdict with the share of the light that the PSF lacks, at most: it is not inside."""
         if self.region is not Region.INSIDE:
             return self
-        decided = CUT_PSF.format(share=share)
-        return replace(self, region=Region.NEAR, findings=(), decided=decided)
+        return replace(self, region=Region.NEAR, findings=(), decided=CUT_PSF.format(share=share))
+
+    def with_background_below_zero(self, share: float) -> Verdict:
+        """Return the verdict with a background's share of the light, below zero: it is not inside."""
+        if self.region is not Region.INSIDE:
+            return self
+        return replace(self, region=Region.NEAR, findings=(), decided=BELOW_ZERO.format(share=share))
 
     def as_json(self) -> dict[str, Any]:
         """Return the verdict for a file."""

@@ -28,6 +28,7 @@ from recon.reconstruction.options import ReconstructionOptions
 from recon.reconstruction.part import Part
 from recon.reconstruction.problem import Problem
 from recon.reconstruction.residual import background_in_words, beyond_in_words
+from recon.verdict.judge import Region
 
 measured = pytest.mark.skipif(
     not (data_folder() / "diffusercam_hand").is_dir(), reason=f"the measured hand is not in {data_folder()}"
@@ -172,3 +173,14 @@ def test_a_psf_cut_to_a_circle_is_no_reason_for_a_background() -> None:
     y, x = (np.arange(n) - n / 2 for n in psf.shape)
     cut = np.where(y[:, None] ** 2 + x**2 < (0.45 * len(y)) ** 2, psf, 0).astype(np.float32)
     assert reconstruct(image, cut, iterations=5, judged=False).background is None
+
+
+@measured
+def test_the_hand_through_a_psf_on_a_hill_of_light_is_not_reliable() -> None:
+    psfs, photograph = measured_set("hand")
+    psf, seen = block_mean(psfs[0], 16), block_mean(photograph, 16)
+    y, x = (np.linspace(-1, 1, n) for n in psf.shape)
+    hill = 0.3 * psf.max() * np.exp(-(y[:, None] ** 2) - x**2)
+    verdict = reconstruct(seen, psf + hill.astype(np.float32)).verdict
+    assert verdict is not None
+    assert verdict.region is not Region.INSIDE

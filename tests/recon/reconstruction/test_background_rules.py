@@ -12,7 +12,7 @@ import pytest
 from recon.camera.vignetting import shade_of
 from recon.errors import InputError
 from recon.priors import L1
-from recon.reconstruction import background as module
+from recon.reconstruction import restored_light as module
 from recon.reconstruction.background import (
     LIT_PICTURE,
     POINTS,

@@ -291,3 +291,12 @@ def test_photographs_are_asked_whether_they_are_coded_where_much_is_unexplained(
     np.testing.assert_allclose(straight([-1.0, 0.0, 2.0, 4.0]), [0, 0, 4 * 0.5**2.2, 4])
     assert one.straightened(photograph, psfs)[1] is psfs
     np.testing.assert_allclose(both.straightened(photograph, psfs)[1], straight(psfs))
+
+
+def test_a_picture_over_a_background_below_zero_is_not_inside() -> None:
+    good = Verdict(Region.INSIDE, "admm tv", 0.0, ())
+    doubted = good.with_background_below_zero(-0.65)
+    assert doubted.region is Region.NEAR
+    assert "below zero, at -65%" in doubted.sentences[0]
+    bad = Verdict(Region.OUTSIDE, "admm tv", 0.9, ())
+    assert bad.with_background_below_zero(-0.65) is bad
