@@ -70,6 +70,24 @@ def as_8_bits(raw: Array) -> Array:
     return (raw >> 8).astype(np.uint8)
 
 
+def in_a_frame(raw: Array, share: float) -> Array:
+    """Return a frame with zeros along its edges, a share of each side."""
+    down, across = (round(share * n) for n in raw.shape)
+    return np.pad(raw[down:-down, across:-across], ((down, down), (across, across)))
+
+
+def half_covered(raw: Array) -> Array:
+    """Return a frame whose right half was covered and has one value."""
+    return np.where(np.arange(raw.shape[1]) < raw.shape[1] // 2, raw, 34).astype(raw.dtype)
+
+
+def under_a_lamp(raw: Array, peak: float) -> Array:
+    """Return a frame with a lamp's reflection of a share of full scale."""
+    y, x = (np.arange(n) for n in raw.shape)
+    far2 = (y[:, None] - 300) ** 2 + (x - 1200) ** 2
+    return counts(light(raw) + peak * FULL * np.exp(-far2 / (2 * 40**2)) + 30)
+
+
 LABS: Mapping[str, Case] = {
     "photograph 8 bits, PSF 16": Case(lambda p, y: (p, as_8_bits(y))),
     "photograph 8 bits, PSF 16, `--mixed-depth`": Case(
@@ -80,6 +98,13 @@ LABS: Mapping[str, Case] = {
         lambda p, y: (p, counts(y + 0.05 * FULL * (np.arange(y.shape[1]) == 777))), known=lambda p, y: (p, y)
     ),
     "PSF: five spots of dust": Case(lambda p, y: (speckled(p, 5), y)),
+    "photograph: five spots of dust": Case(lambda p, y: (p, speckled(y, 5)), known=lambda p, y: (p, y)),
+    "photograph: a lamp's reflection": Case(
+        lambda p, y: (p, under_a_lamp(y, 0.5)), known=lambda p, y: (p, y)
+    ),
+    "photograph: zeros along its edges, 5 % a side": Case(lambda p, y: (p, in_a_frame(y, 0.05))),
+    "both: zeros along the edges, 5 % a side": Case(lambda p, y: (in_a_frame(p, 0.05), in_a_frame(y, 0.05))),
+    "photograph: half of it covered": Case(lambda p, y: (p, half_covered(y))),
     "PSF over light that grows across, 2 %": Case(
         lambda p, y: (on_a_slope(p, 0.02), y), known=lambda p, y: (p, y)
     ),
