@@ -52,7 +52,8 @@ def _varied(lines: Float32Array, within: slice) -> slice:
 
 def _unseen(image: Float32Array, valid: BoolArray) -> BoolArray:
     unseen = np.zeros(image.shape, bool)
-    rows, columns = seen_window(image)
+    # A line with an erased pixel has no one value: a colour of a mosaic has none at all in every other one.
+    rows, columns = seen_window(np.where(valid, image, np.float32(np.nan)))
     if (rows, columns) == tuple(slice(0, n) for n in image.shape):
         return unseen
     noise = estimate_deviation(image[rows, columns], valid[rows, columns])

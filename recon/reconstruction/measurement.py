@@ -69,7 +69,7 @@ class Measurement:
     vignetting : array, (height, width) or as ``image``, optional
         Relative light on the pixels, about 1 at most, which the PSF does not have: the image less its
         background is divided by it. None: looked for where light is missing
-        (:mod:`recon.reconstruction.restored_light`).
+        (:mod:`recon.reconstruction.mending.restored_light`).
     lines : array, (height, width) or as ``image``, optional
         Offsets that whole rows and columns share, counts: subtracted as the background is. None: looked for
         (:mod:`recon.base.shared_lines`).

@@ -26,12 +26,12 @@ from recon.reconstruction.background import (
 from recon.reconstruction.choice import Choice
 from recon.reconstruction.colours import channels_of, merged
 from recon.reconstruction.measurement import LINES_FOUND, Measurement, OfOnePhotograph
+from recon.reconstruction.mending.restored_light import EXPLAINS, with_light_restored
 from recon.reconstruction.options import Overrides, ReconstructionOptions
 from recon.reconstruction.planes import BEYOND, between_of, no_beyond, planes_of, with_planes_beyond
 from recon.reconstruction.probe import COARSE_PX, camera_cost, coarse_copy, coarse_passes, within_of
 from recon.reconstruction.problem import Problem, Stage
 from recon.reconstruction.reduction import on_blocks, reduced, reduced_calibration
-from recon.reconstruction.restored_light import EXPLAINS, with_light_restored
 from recon.reconstruction.rules import (
     SETTLED,
     USUAL_ITERATIONS,

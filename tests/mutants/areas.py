@@ -179,7 +179,7 @@ AREAS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
             "recon/base/shared_lines.py",
             "recon/camera/vignetting.py",
             "recon/reconstruction/background.py",
-            "recon/reconstruction/restored_light.py",
+            "recon/reconstruction/mending/restored_light.py",
             "recon/reconstruction/planes.py",
         ),
         (

@@ -70,6 +70,12 @@ def test_pixels_that_are_erased_already_are_not_counted_again() -> None:
     assert not (erased(image, image > 0) & (image == 0)).any()
 
 
+def test_a_colour_of_a_mosaic_keeps_its_lines() -> None:
+    known = np.zeros(SHAPE, bool)
+    known[::2, ::2] = True
+    assert not erased(np.where(known, lit() + 100, 0), known).any()
+
+
 def test_a_problem_says_so() -> None:
     psf = lit()
     problem = Problem.of(framed(lit(900.0), 6, 6, 6, 6, 0.0), psf)

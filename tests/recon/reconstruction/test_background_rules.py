@@ -12,7 +12,6 @@ import pytest
 from recon.camera.vignetting import shade_of
 from recon.errors import InputError
 from recon.priors import L1
-from recon.reconstruction import restored_light as module
 from recon.reconstruction.background import (
     LIT_PICTURE,
     POINTS,
@@ -23,15 +22,16 @@ from recon.reconstruction.background import (
     floor,
 )
 from recon.reconstruction.measurement import Measurement
-from recon.reconstruction.options import Overrides, ReconstructionOptions
-from recon.reconstruction.problem import Problem
-from recon.reconstruction.restored_light import (
+from recon.reconstruction.mending import restored_light as module
+from recon.reconstruction.mending.restored_light import (
     _least,
     _offset_of,
     _shade_of,
     _Small,
     with_light_restored,
 )
+from recon.reconstruction.options import Overrides, ReconstructionOptions
+from recon.reconstruction.problem import Problem
 from recon.types import Calibration
 
 Counts = np.ndarray[Any, np.dtype[Any]]

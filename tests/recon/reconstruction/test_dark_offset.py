@@ -8,9 +8,9 @@ import pytest
 from recon import reconstruct
 from recon.evaluation.scene import TestScene, make_scene
 from recon.reconstruction.measurement import Measurement
+from recon.reconstruction.mending.restored_light import with_light_restored
 from recon.reconstruction.options import ReconstructionOptions
 from recon.reconstruction.problem import Problem
-from recon.reconstruction.restored_light import with_light_restored
 from recon.reconstruction.selection import choose
 from recon.types import Calibration
 

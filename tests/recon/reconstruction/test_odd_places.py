@@ -9,9 +9,9 @@ from recon import reconstruct
 from recon.arrays import Float32Array
 from recon.base.blocks import block_mean, blocks_about_axis
 from recon.evaluation.measured_sets import data_folder, measured_set
-from recon.reconstruction.odd_places import LONGEST_PX, MOST, odd_places, on_pixels
+from recon.reconstruction.mending.odd_places import LONGEST_PX, MOST, odd_places, on_pixels
+from recon.reconstruction.mending.restored_light import LOOKED, _on_blocks
 from recon.reconstruction.problem import Problem
-from recon.reconstruction.restored_light import LOOKED, _on_blocks
 
 hand_is_here = pytest.mark.skipif(
     not (data_folder() / "diffusercam_hand").is_dir(), reason=f"the measured hand is not in {data_folder()}"

@@ -16,9 +16,9 @@ from recon.errors import InputError
 from recon.evaluation.measured_sets import data_folder, measured_set
 from recon.evaluation.scene import make_scene
 from recon.reconstruction.measurement import Measurement
+from recon.reconstruction.mending.restored_light import with_light_restored
 from recon.reconstruction.options import ReconstructionOptions
 from recon.reconstruction.problem import Problem
-from recon.reconstruction.restored_light import with_light_restored
 from recon.reconstruction.selection import choose, with_background
 from recon.reconstruction.solve import solve
 from recon.reconstruction.uncertainty import Replicas

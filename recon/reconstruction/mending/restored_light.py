@@ -20,9 +20,9 @@ from recon.base.blocks import whole_blocks
 from recon.camera.camera_model import CAMERAS
 from recon.camera.vignetting import DEEPEST, least_squares, shade_of
 from recon.priors import Prior
-from recon.reconstruction import odd_places
 from recon.reconstruction.background import DARKEST_PERCENTILE, floor
 from recon.reconstruction.measurement import Measurement
+from recon.reconstruction.mending import odd_places
 from recon.reconstruction.options import ReconstructionOptions
 from recon.reconstruction.pilot import MODEL_ERROR, pilot
 from recon.reconstruction.problem import Problem

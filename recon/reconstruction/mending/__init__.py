@@ -1,0 +1,1 @@
+"""What keeps a photograph from being explained by light through its PSF, looked for and mended."""
