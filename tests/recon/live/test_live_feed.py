@@ -263,3 +263,15 @@ def test_of_all_depths_together_none_is_said_to_fit() -> None:
     calibration = Calibration(psfs, np.array([[0.0, 0.0, 1e4], [0.0, 0.0, 2e4]]))
     together = LiveReconstructor(calibration, noise=NOISE, coarsest=1)
     assert together.fitting_depth_um(np.zeros((32, 40), np.float32)) is None
+
+
+@pytest.mark.parametrize(
+    ("finest", "coarsest", "binnings"),
+    [(1, 8, {1, 2, 3, 4}), (1, 2, {1, 2}), (2, 8, {2, 3, 4}), (6, 8, {6})],
+)
+def test_no_binning_leaves_less_than_sixteen_pixels_but_the_finest(
+    finest: int, coarsest: int, binnings: set[int]
+) -> None:
+    assert SHAPE == (64, 96)
+    found = live(finest=finest, coarsest=coarsest)._details.values()
+    assert {detail.binning for detail in found} == binnings
