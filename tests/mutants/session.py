@@ -69,7 +69,13 @@ def _digest(file: str) -> str:
 class _Child:
     process: int
     answer: Path
-    ends_s: float
+    began_s: float
+    limit_s: float
+
+    @property
+    def is_late(self) -> bool:
+        """Whether it has taken too long, less what it waited for a processor that others had."""
+        return time.monotonic() - self.began_s - _waited_s(str(self.process)) > self.limit_s
 
 
 class Trials:
@@ -273,8 +279,8 @@ class Trials:
     def _fork(self, work: Callable[[], object], limit_s: float) -> _Child:
         """Do something in a process of its own, with its own temporary folder.
 
-        It has ``limit_s`` of the processor, and on the clock as much longer as others crowd the machine, up
-        to an hour: what ends it counts as noticed.
+        It has ``limit_s`` of the processor, and of the clock without what it waits for others: what ends it
+        counts as noticed.
         """
         self._number += 1
         answer = self._folder / str(self._number)
@@ -282,8 +288,7 @@ class Trials:
         process = os.fork()
         if process:
             self._alive.add(process)
-            crowd = max(2 * os.getloadavg()[0] / (os.cpu_count() or 1), 1.0)
-            return _Child(process, answer, time.monotonic() + max(min(crowd * limit_s, 3600), limit_s))
+            return _Child(process, answer, time.monotonic(), limit_s)
         try:
             os.setpgid(0, 0)
             signal.signal(signal.SIGTERM, signal.SIG_DFL)
@@ -305,7 +310,7 @@ class Trials:
     def _done(self, child: _Child) -> tuple[bool, Any]:
         """Return whether a process ended, and what it answered: None where it did not."""
         ended, _ = os.waitpid(child.process, os.WNOHANG)
-        if not ended and time.monotonic() < child.ends_s:
+        if not ended and not child.is_late:
             return False, None
         self._end(child.process)
         if not ended:
@@ -335,9 +340,12 @@ def _functions() -> dict[tuple[str, str, int], list[FunctionType]]:
     return found
 
 
-def _waited_s() -> float:
-    """Return how long this thread has waited for a processor that others had; 0 where no kernel tells it."""
-    told = Path("/proc/thread-self/schedstat")
+def _waited_s(process: str = "thread-self") -> float:
+    """Return how long this thread, or a process' first, has waited for a processor that others had, seconds.
+
+    0 where no kernel tells it.
+    """
+    told = Path("/proc", process, "schedstat")
     return int(told.read_text().split()[1]) / 1e9 if told.is_file() else 0.0
 
 

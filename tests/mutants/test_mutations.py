@@ -97,6 +97,11 @@ def test_no_process_with_a_mutant_outlives_the_run(tmp_path: Path) -> None:
     trials.pytest_configure(SimpleNamespace(_tmp_path_factory=SimpleNamespace()))  # type: ignore[arg-type]
     child = trials._fork(lambda: time.sleep(60), 100.0)
     time.sleep(0.1)  # its process group is its own by then
+    assert trials._done(child) == (False, None)
+    late = trials._fork(lambda: time.sleep(60), 0.05)
+    while not (told := trials._done(late))[0]:  # what it waits for a processor does not count
+        time.sleep(0.01)
+    assert told == (True, None)
     os.kill(child.process, 0)
     trials.end_processes()
     with pytest.raises(ProcessLookupError):
