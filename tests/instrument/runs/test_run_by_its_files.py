@@ -290,3 +290,11 @@ def test_a_runs_own_file_is_not_written_to_by_another_name_either(tmp_path: Path
 def test_pictures_of_a_run_have_names_of_one_length(tmp_path: Path) -> None:
     export(Run.open(recorded(tmp_path, 3, 10)), tmp_path / "pictures")
     assert sorted(one.name for one in (tmp_path / "pictures").iterdir()) == ["frame-03.png", "frame-10.png"]
+
+
+def test_a_plans_frames_and_one_alone_have_no_period(tmp_path: Path) -> None:
+    assert Run.open(recorded(tmp_path / "recordings", 4)).frame_period_s is None
+    with new_run(tmp_path) as writer:
+        later = replace(frame(1), metadata=replace(frame(1).metadata, device_time_ns=20_000_123))
+        writer.write([frame(0), later])
+        assert Run.open(writer.path).frame_period_s is None
