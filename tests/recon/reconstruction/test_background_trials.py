@@ -19,12 +19,12 @@ from recon.reconstruction.background import (
     VOLUME,
     Taken,
     Trial,
-    _left2,
-    _small,
     _tried,
     trial_of,
 )
 from recon.reconstruction.measurement import Measurement
+from recon.reconstruction.mending import restored_light
+from recon.reconstruction.mending.restored_light import _left2, _small
 from recon.reconstruction.options import ReconstructionOptions
 from recon.reconstruction.problem import Problem
 from recon.types import Calibration
@@ -208,7 +208,7 @@ def test_erased_pixels_are_nothing_with_an_offset_and_are_not_counted(
         data: np.ndarray
         valid: np.ndarray
 
-    monkeypatch.setattr(module, "pilot", pilot)
+    monkeypatch.setattr(restored_light, "pilot", pilot)
     channel: Any = Channel(np.full((1, 6, 8), 2.0, np.float32), VALID[None])
     assert _left2(channel, 1.5) == pytest.approx(9)
     np.testing.assert_array_equal(given[0][0], np.where(VALID, 3.5, 0))
