@@ -384,7 +384,9 @@ def restored(
         return np.array([{0.0: given2, module.MOST_OFFSET: explained2}[offset]])
 
     monkeypatch.setattr(module, "_small", lambda *_: None)
-    monkeypatch.setattr(_Small, "__init__", lambda self, _: vars(self).update(mean=mean, usual2=np.zeros(1)))
+    facts = {"mean": mean, "usual2": np.zeros(1), "channels": []}
+    monkeypatch.setattr(_Small, "__init__", lambda self, _: vars(self).update(facts))
+    monkeypatch.setattr(module.odd_places, "odd_places", lambda *_: None)
     monkeypatch.setattr(_Small, "left2", left2)
     monkeypatch.setattr(module, "_shade_of", lambda *_: numbers)
     monkeypatch.setattr(module, "_offset_of", lambda *_: share)
