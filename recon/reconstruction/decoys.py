@@ -167,7 +167,7 @@ def _checked(problem: Problem, on_stage: Stage | None) -> CalibrationCheck | Non
         again = _competition(small, in_light)
         own, cleared, stands = as_given(again.scores), again.fit is Fit.FITS, True
         if check.better is not None:  # which this competition may not have come to
-            accuser = in_light(check.better)
+            accuser = again.scores.get(check.better) or in_light(check.better)
             cleared = cleared and is_told(own, accuser, small.pixels)
             stands = not _is_near(check.better) or is_ahead(accuser, (own,), small.pixels, NEARLY)
         check = again if cleared else check if stands else replace(again, fit=Fit.UNTOLD, better=None)

@@ -187,7 +187,7 @@ def test_a_reason_goes_with_the_camera(
     monkeypatch.setattr(camera, "start_sequence", busy)
     session.viewing.start()
     qtbot.waitUntil(live.again_button.isVisible, timeout=WAIT_MS)
-    session.note_failure(DeviceError(camera.name, "was unplugged."), surely=True)
+    session.note_failure(DeviceError(camera.name, "was unplugged."), surely=True, was_used=True)
     assert session.state("camera").condition == "failed"
     live.count()
     assert live.again_button.isHidden()

@@ -287,7 +287,7 @@ def test_after_a_fault_the_way_on_is_a_button_where_it_happened(
     for doubted, settled in ((camera, True), (f"{camera}, {light}", False)):  # the light only refused
         panel._failed(Ended(f"{MOTION_DOUBT}: {doubted} did not answer."))
         assert "may not be safe" in panel.run_bar.words.text()
-        session.note_failure(DeviceError(camera, "was lost."), surely=True)
+        session.note_failure(DeviceError(camera, "was lost."), surely=True, was_used=True)
         assert "may not be safe" in panel.run_bar.words.text()
         qtbot.waitUntil(again.isVisible, timeout=WAIT_MS)
         press(qtbot, again)
