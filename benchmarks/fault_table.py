@@ -19,8 +19,10 @@ unplugged  raises DeviceLostError, as does every later call of that device
 Of each is printed whether the light was off and motion stopped in the end (``said``: the device could no
 longer be told, and the program says so), what the run calls itself and whether ``verify`` finds it sound, the
 exit code, and the sentence. Where a call that hangs is not given up, the trial gets Ctrl-C after some
-seconds (``held up``). A fault that changes nothing that is used is ``harmless``: exit code 0, light off, the
-run complete. Exit status 1 when anything else was found than that.
+seconds (``held up``; of ``--first``, which does not know how long the work takes, after ten minutes). Of a
+trial that ended before its call nothing is known (``not reached``). A fault that changes nothing that is
+used is ``harmless``: exit code 0, light off, the run complete. Exit status 1 when anything else was
+found than that.
 """
 
 from __future__ import annotations
@@ -122,7 +124,7 @@ class Outcome:
 
     @property
     def judged(self) -> str:
-        """``ok``, ``harmless``, ``held up``, or what is wrong."""
+        """``ok``, ``harmless``, ``held up``, ``not reached``, or what is wrong."""
         wrong = [
             what
             for what, found in (
@@ -138,7 +140,9 @@ class Outcome:
         ]
         if wrong:
             return ", ".join(wrong).upper()
-        return "harmless" if self.code == 0 else "held up" if self.held_up else "ok"
+        if self.code == 0:
+            return "harmless" if self.call else "not reached"
+        return "held up" if self.held_up else "ok"
 
 
 class Faulty:
@@ -389,7 +393,7 @@ def run(arguments: list[str] | None = None) -> int:
             main(WORK["snap"])  # what is imported and compiled here, no trial waits for
         for work in asked.work or WORK:
             counts += table(work, asked.fault or list(FAULTS), asked.every, asked.seed, asked.first, folder)
-    return 1 if set(counts) - {"ok", "harmless", "held up"} else 0
+    return 1 if set(counts) - {"ok", "harmless", "held up", "not reached"} else 0
 
 
 if __name__ == "__main__":
