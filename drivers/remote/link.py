@@ -211,7 +211,9 @@ class Link:
                 await hold.send_str("close")
                 said = await hold.receive()
                 if isinstance(said.data, str) and "error" in (answer := json.loads(said.data)):
-                    raise load_error(self._name, answer["error"])
+                    error = load_error(self._name, answer["error"])
+                    if not isinstance(error, StoppedError):  # which ended the hold just before
+                        raise error
         finally:
             await self._forget()
 
@@ -226,14 +228,15 @@ class Link:
 
         Raises DeviceError: the device's own; DeviceLostError when the connection broke meanwhile.
         """
-        if call.verb != "PUT" or self._hold is None:  # a stop is tried whatever became of the hold
-            self.require()
         data = self._wait(self._request(call, arguments))
         if call.gives.is_frame:
             return unpack_frame(data)
         return call.gives.load(json.loads(data)["value"])
 
     async def _request(self, call: Call, arguments: Mapping[str, Any]) -> bytes:
+        # Asked here, as what ends the hold later ends this, too.
+        if call.verb != "PUT" or self._hold is None:  # a stop is tried whatever became of the hold
+            self.require()
         number = next(self._numbers)  # of the whole: a stop during its arrays overtakes it
         said = {
             name: {"upload": await self._upload(value)} if isinstance(value, memoryview) else value
@@ -255,13 +258,17 @@ class Link:
 
         if self._session is None:
             raise DeviceNotOpenError(self._name)
+        limit_s = None if self.failure is None else self._options.lost_after_s  # no hold says that it is lost
         try:
-            async with self._session.request(
-                verb,
-                f"/api/devices/{self._kind}/{name}",
-                headers={NUMBER_HEADER: str(number)},
-                **named,
-            ) as reply:
+            async with (
+                asyncio.timeout(limit_s),
+                self._session.request(
+                    verb,
+                    f"/api/devices/{self._kind}/{name}",
+                    headers={NUMBER_HEADER: str(number)},
+                    **named,
+                ) as reply,
+            ):
                 data = await reply.read()
                 if reply.status == 200:
                     return data

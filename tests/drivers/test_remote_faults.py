@@ -156,6 +156,28 @@ def test_a_lost_operator_leaves_no_light_and_no_motion(
         device.close()
 
 
+@pytest.mark.parametrize("stop", [False, True], ids=["a setting", "a stop"])
+def test_a_call_that_begins_when_the_hold_was_lost_has_an_end(
+    network: BadNetwork, options: RemoteOptions, monkeypatch: pytest.MonkeyPatch, stop: bool
+) -> None:
+    """Nothing ended the request of a call that had been let through just before, nor that of a stop."""
+    leds = RemoteLedArray(options)
+    leds.open()
+    held, look = leds._link, leds._link._wait
+
+    def lost(work: Any) -> Any:
+        network.silent = True
+        assert until(lambda: held.failure is not None)
+        return look(work)
+
+    monkeypatch.setattr(held, "_wait", lost)
+    calling, errors = in_thread(leds.off if stop else lambda: leds.set_pattern(LIT))
+    calling.join(PATIENCE_S)
+    monkeypatch.undo()
+    assert isinstance(errors[0], DeviceLostError)
+    leds.close()
+
+
 @pytest.mark.parametrize(
     "failure", [DeviceError("stage", "does not answer."), OSError("Input/output error")], ids=["said", "raw"]
 )
