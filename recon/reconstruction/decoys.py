@@ -70,6 +70,9 @@ moved: another diffuser's is "8 % smaller" or 11 by chance."""
 MOST_DECOYS = 12
 """With farther ones on the side of a near one that is better, each twice as far: to some eight degrees or per
 cent. Usually there are eight."""
+FARTHEST_DEG, FARTHEST_SCALE = 20.0, 0.3
+"""Turn, and change of size (of its logarithm), beyond which none is tried: where few decoys differ, as of
+smooth PSFs, they went on to patterns so small that nothing was left of them."""
 TRIES, NEARLY_ALL = 60, 0.95
 """Of the quick way, about as many as it takes where they do not clear the calibration; and the share of it
 that is told where it takes more."""
@@ -298,6 +301,8 @@ def _competition(small: _Small, scored: Callable[[Transformation], Score]) -> Ca
     before, best = GIVEN, min((GIVEN, *near), key=lambda how: scores[how].objective)
     while scores[best].objective < scores[before].objective and len(scores) < MOST_DECOYS:
         before, best = best, Transformation(scale=best.scale**2, rotation_deg=2 * best.rotation_deg)
+        if abs(best.rotation_deg) > FARTHEST_DEG or abs(np.log(best.scale)) > FARTHEST_SCALE:
+            break
         scores[best] = scored(best)
     return check_of(scores, small.pixels, structure)
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 import threading
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import fields, replace
 from typing import Any
 
@@ -264,23 +264,31 @@ def judged(
     tell(0.0, "judging the result")
     verdict, said = _verdict(small, problem, started=started)
     if verdict is not None:
-        what = "The calibration was not checked"
-        try:
-            check = check_calibration(problem, on_stage=tell)
-            verdict = verdict if check is None else verdict.with_calibration(check)
-            what = "Whether the PSF lacks light that the picture needs was not looked at"
-            missing = lacking(small, problem)
-            if missing is not None and missing.much:
-                verdict = verdict.with_cut_psf(missing.of_all / (1 + missing.of_all))
-            smooth = _smooth_share(small, problem)
-            if is_below_zero(smooth):
-                verdict = verdict.with_background_below_zero(smooth)
-            what = "No pixels were held out"
-            if unlike_any(verdict):
-                missed = held_out_error(small, problem, on_stage=tell, cancel=cancel)
-                verdict = replace(verdict, held_out=missed)
-        except Exception as error:  # noqa: BLE001 - the verdict says what it says without it
-            said = (*said, f"{what}: {error}")
+        looks: tuple[tuple[str, Callable[[Verdict], Verdict]], ...] = (
+            (
+                "The calibration was not checked",
+                functools.partial(_with_decoys, problem=problem, on_stage=tell),
+            ),
+            (
+                "Whether the PSF lacks light that the picture needs was not looked at",
+                functools.partial(_with_missing_light, result=small, problem=problem),
+            ),
+            (
+                "Whether the background explains what the picture should was not looked at",
+                functools.partial(_with_background, result=small, problem=problem),
+            ),
+            (
+                "No pixels were held out",
+                functools.partial(
+                    _with_held_out, result=small, problem=problem, on_stage=tell, cancel=cancel
+                ),
+            ),
+        )
+        for not_told, look in looks:
+            try:
+                verdict = look(verdict)
+            except Exception as error:  # noqa: BLE001 - the verdict says what it says without it
+                said = (*said, f"{not_told}: {error}")
     tell(1.0, "judged")
     uncertainty = result.uncertainty
     if uncertainty is not None and verdict is not None and verdict.calibration is not None:
@@ -296,6 +304,36 @@ def judged(
         warnings=warnings,
         basis=None,
     )
+
+
+def _with_decoys(verdict: Verdict, *, problem: Problem, on_stage: Stage) -> Verdict:
+    check = check_calibration(problem, on_stage=on_stage)
+    return verdict if check is None else verdict.with_calibration(check)
+
+
+def _with_missing_light(verdict: Verdict, *, result: Reconstruction, problem: Problem) -> Verdict:
+    missing = lacking(result, problem)
+    if missing is None or not missing.much:
+        return verdict
+    return verdict.with_cut_psf(missing.of_all / (1 + missing.of_all))
+
+
+def _with_background(verdict: Verdict, *, result: Reconstruction, problem: Problem) -> Verdict:
+    smooth = _smooth_share(result, problem)
+    return verdict.with_background_below_zero(smooth) if is_below_zero(smooth) else verdict
+
+
+def _with_held_out(
+    verdict: Verdict,
+    *,
+    result: Reconstruction,
+    problem: Problem,
+    on_stage: Stage,
+    cancel: threading.Event | None,
+) -> Verdict:
+    if not unlike_any(verdict):
+        return verdict
+    return replace(verdict, held_out=held_out_error(result, problem, on_stage=on_stage, cancel=cancel))
 
 
 def _verdict(

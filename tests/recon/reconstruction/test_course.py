@@ -140,6 +140,21 @@ def test_an_error_in_a_part_of_judging_leaves_the_verdict_and_says_which(monkeyp
     assert f"{what}: a decoy without light" in result.warnings
 
 
+def test_nor_does_it_keep_another_part_from_telling(monkeypatch):
+    """A PSF over a broad hill was called reliable where its decoys could not be tried."""
+
+    def broken(*_arguments, **_options):
+        raise ZeroDivisionError("a decoy without light")
+
+    asked = []
+    monkeypatch.setattr(door, "check_calibration", broken)
+    for part in ("lacking", "is_below_zero"):
+        monkeypatch.setattr(door, part, lambda *_, part=part: asked.append(part))
+    scene = make_scene("text", size=24)
+    assert reconstruct(scene.measurement, scene.calibration, iterations=5).verdict is not None
+    assert asked == ["lacking", "is_below_zero"]
+
+
 def history(unrest, each_s=0.1, n=TOLD_AT):
     return [IterationRecord(k, each_s * k, change=unrest(k)) for k in range(1, n + 1)]
 

@@ -126,6 +126,19 @@ def test_a_photograph_mostly_at_full_scale_has_its_noise_and_accuses_nobody(
             assert check.fit is Fit.UNTOLD
 
 
+def test_no_copy_of_a_smooth_psf_is_so_small_that_nothing_is_left_of_it() -> None:
+    """A hill is its own mirror image: its few decoys left room for sizes of a fourth and less."""
+    rows, columns = (np.linspace(-1, 1, n) for n in (75, 100))
+    hill = np.exp(-(rows[:, None] ** 2 + columns**2) / 0.1).astype(np.float32)
+    narrow = np.exp(-(rows[:, None] ** 2 + columns**2) / 0.04).astype(np.float32)
+    photograph = np.random.default_rng(2).poisson(2e4 * narrow + 20).astype(np.float32)
+    check = check_calibration(Problem.of(photograph, hill))
+    assert check is not None
+    assert all(
+        0.7 < how.scale < 1.4 and abs(how.rotation_deg) <= 20 for how in check.scores if how not in FAR
+    )
+
+
 @pytest.mark.parametrize("said", decoys.CONTRADICTIONS)
 def test_what_contradicts_itself_is_not_told(
     seen: tuple[Float32Array, Float32Array], monkeypatch: pytest.MonkeyPatch, said: tuple[Fit, Fit]
